@@ -158,6 +158,49 @@ fn no_form_of_a_planted_journal_is_carried_out() {
     }
 }
 
+/// A link in place of a folder would let a repair move and remove files outside the checkpoint.
+#[test]
+fn a_link_or_a_file_in_place_of_a_folder_is_refused() {
+    for place in [".ckpt-doctor", ".ckpt-doctor/new", ".ckpt-doctor/undo", ".ckpt-doctor/undo/1"] {
+        for is_link in [true, false] {
+            let (room, model) = broken();
+            let outside = room.path().join("outside");
+            fs::create_dir(&outside).expect("a folder");
+            fs::write(outside.join("config.json"), "of others").expect("a file");
+            let place = model.join(place);
+            fs::create_dir_all(place.parent().expect("a parent")).expect("a folder");
+            if is_link {
+                symlink(&outside, &place).expect("a link");
+            } else {
+                fs::write(&place, "").expect("a file");
+            }
+            let before = tree(room.path());
+            for args in [&["check", "model", "--fix"][..], &["undo", "model"]] {
+                let (code, text) = doctor(room.path(), args);
+                assert!(code == Some(2) && text.contains("it is not a directory"), "{place:?}: {text}");
+                assert_eq!(tree(room.path()), before, "{place:?}");
+            }
+        }
+    }
+}
+
+/// Whoever vouches for a journal does not vouch for files outside the checkpoint, or for those of the tool.
+#[test]
+fn an_adopted_journal_names_files_of_the_checkpoint_alone() {
+    for name in ["../config.json", "a/config.json", "..", "", ".gitattributes"] {
+        let (room, model) = broken();
+        plant(&model, 2, &json!({}));
+        let path = model.join(".ckpt-doctor/journal.json");
+        let mut journal: Value = serde_json::from_slice(&fs::read(&path).expect("a file")).expect("JSON");
+        journal["files"][0]["name"] = json!(name);
+        fs::write(&path, journal.to_string()).expect("a file");
+        let before = tree(room.path());
+        let (code, text) = doctor(room.path(), &["check", "model", "--fix", "--adopt-journal"]);
+        assert!(code == Some(2) && text.contains("is not a plain file name"), "{name}: {text}");
+        assert_eq!(tree(room.path()), before, "{name}");
+    }
+}
+
 #[test]
 fn a_donor_with_a_journal_of_others_is_refused() {
     let room = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a temporary directory");

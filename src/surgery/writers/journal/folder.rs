@@ -54,6 +54,7 @@ impl Folder {
         if look(&path)?.is_none_or(|m| !m.is_dir()) {
             return Ok(Remains::None);
         }
+        only_folders(&path)?;
         if [REPAIR_JOURNAL, DRAFT, NEW].iter().any(|name| fs::symlink_metadata(path.join(name)).is_ok()) {
             return Ok(Remains::Interrupted);
         }
@@ -332,17 +333,19 @@ fn numbers(path: &Path) -> Result<Vec<u32>, RepairError> {
 
 /// Refuses symbolic links in place of folders: through them, a checkpoint from elsewhere could move files outside it.
 fn only_folders(path: &Path) -> Result<(), RepairError> {
+    let is_there = |folder: &Path| match look(folder)? {
+        Some(meta) if !meta.is_dir() => {
+            Err(RepairError::UnusableJournal { path: folder.to_owned(), reason: "it is not a directory".to_owned() })
+        }
+        meta => Ok(meta.is_some()),
+    };
     let undo = path.join(UNDO);
-    let mut folders = vec![path.to_owned(), path.join(NEW), undo.clone()];
-    if look(&undo)?.is_some_and(|m| m.is_dir()) {
-        folders.extend(names(&undo)?.iter().filter(|name| name.parse::<u32>().is_ok()).map(|name| undo.join(name)));
-    }
-    for folder in folders {
-        if look(&folder)?.is_some_and(|m| !m.is_dir()) {
-            return Err(RepairError::UnusableJournal { path: folder, reason: "it is not a directory".to_owned() });
+    if is_there(path)? && is_there(&undo)? {
+        for name in names(&undo)?.iter().filter(|name| name.parse::<u32>().is_ok()) {
+            is_there(&undo.join(name))?;
         }
     }
-    Ok(())
+    is_there(&path.join(NEW)).map(|_| ())
 }
 
 /// Names in a folder; empty when it is missing.
