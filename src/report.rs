@@ -38,6 +38,8 @@ mod terminal;
 #[cfg(feature = "cli")]
 pub mod verification;
 
+#[cfg(feature = "cli")]
+pub(crate) use format::wrap;
 pub use model::Report;
 #[cfg(feature = "cli")]
 pub use statistics::statistics;
