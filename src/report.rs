@@ -66,6 +66,7 @@ impl Report {
 pub fn render(report: &Report, format: Format, style: Style) -> String {
     match format {
         Format::Full => terminal::render(report, style),
+        Format::Table => terminal::table(report, style),
         Format::Concise => concise::render(report, style),
         Format::Json => report.to_json(),
         Format::Jsonl => json::lines(report),

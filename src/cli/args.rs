@@ -348,7 +348,8 @@ pub struct CheckArgs {
     /// Lowest severity that is reported; the exit code depends on --fail-on alone [default: info]
     #[arg(long, value_name = "SEVERITY", help_heading = "Output")]
     pub min_severity: Option<SeverityName>,
-    /// Print findings only: neither the table, checkpoints without findings nor the summary (formats full and concise)
+    /// Print findings only: neither the table, checkpoints without findings nor the summary (formats full and concise); rows
+    /// with findings only (format table)
     #[arg(short, long, help_heading = "Output", conflicts_with_all = ["statistics", "verbose"])]
     pub quiet: bool,
     /// Explain why each skipped rule was skipped

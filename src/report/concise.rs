@@ -15,6 +15,12 @@ pub fn render(report: &Report, style: Style) -> String {
             findings(&mut out, checkpoint, cap);
         }
     }
+    seams(&mut out, report, cap);
+    out
+}
+
+/// The seams of a stopped merge, one per line.
+pub fn seams(out: &mut String, report: &Report, cap: usize) {
     if let Some(merge) = &report.merge {
         for seam in merge.seams.iter().take(cap) {
             let _ok = write!(out, "{}: error[seam] {}", name(&merge.recipe), sentence(&seam.message));
@@ -27,7 +33,6 @@ pub fn render(report: &Report, style: Style) -> String {
             let _ok = writeln!(out, "{}: {more} seams", name(&merge.recipe));
         }
     }
-    out
 }
 
 fn findings(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {

@@ -18,7 +18,7 @@ pub fn render(report: &Report, cap: usize) -> String {
     } else {
         out.push_str("# Checkpoint report\n");
     }
-    if let Some(overview) = Overview::new(report) {
+    if let Some(overview) = Overview::of_several(report) {
         checkpoints(&mut out, &overview);
     }
     if !report.unchecked.is_empty() {

@@ -6,7 +6,8 @@ use super::format::worst_first;
 use super::model::{CheckpointReport, Report};
 use crate::check::verdict::LoadVerdict;
 
-/// The table of a run over several checkpoints; `full` and `markdown` start with it.
+/// The table of a run, a row for each checkpoint: `full` and `markdown` start with it if there are several, and `table` is nothing
+/// else.
 pub struct Overview<'a> {
     /// Versions of transformers of the run, ascending: the loaders that were modelled.
     pub loaders: Vec<&'a str>,
@@ -23,11 +24,13 @@ pub struct OverviewRow<'a> {
 }
 
 impl<'a> Overview<'a> {
-    /// The table of a report; `None` for a merge or a single checkpoint.
-    pub fn new(report: &'a Report) -> Option<Self> {
-        if report.merge.is_some() || report.checkpoints.len() < 2 {
-            return None;
-        }
+    /// The table of a report that has more below it; `None` for a merge or a single checkpoint, which it would repeat.
+    pub fn of_several(report: &'a Report) -> Option<Self> {
+        (report.merge.is_none() && report.checkpoints.len() > 1).then(|| Self::new(report))
+    }
+
+    /// The table of a report.
+    pub fn new(report: &'a Report) -> Self {
         let loads = report.checkpoints.iter().flat_map(|c| &c.loads);
         let loaders: BTreeMap<Vec<u64>, &str> = loads.map(|load| (version(&load.loader), &*load.loader)).collect();
         let loaders: Vec<&str> = loaders.into_values().collect();
@@ -39,7 +42,7 @@ impl<'a> Overview<'a> {
             verdicts: loaders.iter().map(|loader| verdict(checkpoint, loader)).collect(),
         };
         let rows = worst_first(report).into_iter().map(row).collect();
-        Some(Self { loaders, rows })
+        Self { loaders, rows }
     }
 }
 

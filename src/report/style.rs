@@ -9,6 +9,8 @@ pub enum Format {
     /// For a terminal: source excerpts and tables.
     #[default]
     Full,
+    /// One line for each checkpoint: what each loader does with it.
+    Table,
     /// One line for each finding: `path/file:line:column: error[CODE] message`.
     Concise,
     /// The JSON contract, complete.
@@ -29,8 +31,9 @@ pub enum Format {
 
 impl Format {
     /// Every format.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 10] = [
         Self::Full,
+        Self::Table,
         Self::Concise,
         Self::Json,
         Self::Jsonl,
@@ -46,6 +49,7 @@ impl Format {
     pub const fn name(self) -> &'static str {
         match self {
             Self::Full => "full",
+            Self::Table => "table",
             Self::Concise => "concise",
             Self::Json => "json",
             Self::Jsonl => "jsonl",
@@ -66,7 +70,9 @@ impl fmt::Display for Format {
 
 /// An unknown format name.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("`{0}` is not an output format; known are full, concise, json, jsonl, github, gitlab, junit, sarif, markdown")]
+#[error(
+    "`{0}` is not an output format; known are full, table, concise, json, jsonl, github, gitlab, junit, sarif, markdown"
+)]
 pub struct UnknownFormat(String);
 
 impl FromStr for Format {

@@ -16,14 +16,32 @@ use super::format::{
 };
 use super::model::{CheckpointReport, Report};
 use super::overview::Overview;
-use super::{Style, fixes};
+use super::{Style, concise, fixes};
 use crate::check::Finding;
+
+/// The table of the checkpoints alone, and the seams of a stopped merge. `quiet` leaves out checkpoints without findings.
+pub fn table(report: &Report, style: Style) -> String {
+    let mut overview = Overview::new(report);
+    overview.rows.retain(|row| !style.quiet || !row.checkpoint.is_quiet());
+    let mut out = String::new();
+    if !overview.rows.is_empty() {
+        overview::render(&mut out, &overview, style);
+    }
+    for row in &overview.rows {
+        if let Some(governed) = governed(row.checkpoint) {
+            let _ok = writeln!(out, "{}: {governed}", name(&row.checkpoint.path));
+        }
+    }
+    concise::seams(&mut out, report, style.cap);
+    out
+}
 
 pub fn render(report: &Report, style: Style) -> String {
     let paint = Paint(style.color);
     let mut out = String::new();
-    if let Some(overview) = Overview::new(report).filter(|_| !style.quiet) {
+    if let Some(overview) = Overview::of_several(report).filter(|_| !style.quiet) {
         overview::render(&mut out, &overview, style);
+        out.push('\n');
     }
     let mut above: Option<&CheckpointReport> = None;
     for checkpoint in worst_first(report) {

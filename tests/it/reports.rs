@@ -53,6 +53,11 @@ fn quiet_reports_contain_findings_only() {
         snapshot!(format!("report-quiet-{format}"), render(&samples::zoo(), format, quiet));
         assert_eq!(render(&samples::clean(), format, quiet), "");
     }
+    let table = |report: &Report, quiet| render(report, Format::Table, Style { quiet, ..PLAIN });
+    assert_eq!(table(&samples::clean(), true), "");
+    assert!(table(&samples::clean(), false).lines().count() > 1);
+    assert!(table(&samples::zoo(), false).contains("a|sound"));
+    assert!(!table(&samples::zoo(), true).contains("a|sound"));
 }
 
 #[test]

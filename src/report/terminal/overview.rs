@@ -1,4 +1,4 @@
-//! The table of a run over several checkpoints.
+//! The table of a run.
 
 use std::fmt::Write as _;
 
@@ -15,7 +15,7 @@ const GAP: usize = 2;
 /// Least width of a cut name.
 const NARROWEST: usize = 8;
 
-/// Renders the table, with an empty line below. Paths and classes are cut to the width of the terminal.
+/// Renders the table. Paths and classes are cut to the width of the terminal.
 pub fn render(out: &mut String, overview: &Overview<'_>, style: Style) {
     let names = overview.rows.iter().map(|row| (name(&row.checkpoint.path), row.class().map_or_else(none, name)));
     let mut names: Vec<(String, String)> = names.collect();
@@ -45,7 +45,6 @@ pub fn render(out: &mut String, overview: &Overview<'_>, style: Style) {
         let line = line.trim_end();
         let _ok = writeln!(out, "{}", if n == 0 { paint.strong(line) } else { line.to_owned() });
     }
-    out.push('\n');
 }
 
 /// The cells after the names.

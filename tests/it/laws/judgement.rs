@@ -134,7 +134,7 @@ fn a_verdict_under_settings_says_so_in_every_format() {
     let room = TempDir::new().unwrap();
     base(&room.path().join("model"));
     comma(&room.path().join("model"));
-    let formats = ["full", "concise", "json", "jsonl", "github", "gitlab", "junit", "sarif", "markdown"];
+    let formats = ["full", "table", "concise", "json", "jsonl", "github", "gitlab", "junit", "sarif", "markdown"];
     for silencing in &SILENCING[..6] {
         fs::write(room.path().join("ckpt-doctor.json5"), silencing).unwrap();
         for format in formats {

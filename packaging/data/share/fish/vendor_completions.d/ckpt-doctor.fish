@@ -57,6 +57,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l config
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l baseline -d 'Do not count the findings listed in this file, and list those that no longer occur' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l output -d 'With --fix: write a repaired copy to this directory and leave the checkpoint unchanged; files without changes become hard links to the originals (on another file system, copies or, above 64 MiB, symbolic links)' -r -F
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l output-format -d 'Format of the report on standard output' -r -f -a "full\t''
+table\t''
 concise\t''
 json\t''
 jsonl\t''
@@ -90,7 +91,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l exit-n
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l adopt-journal -d 'With --fix: also finish or roll back an interrupted repair that you did not begin in this directory, such as one in a copy. Its journal decides which files are written, so know where the directory comes from'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l exit-zero -d 'Exit with 0 even if there are findings'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l statistics -d 'Count the findings of each rule instead of showing them (formats full, concise and json)'
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -s q -l quiet -d 'Print findings only: neither the table, checkpoints without findings nor the summary (formats full and concise)'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -s q -l quiet -d 'Print findings only: neither the table, checkpoints without findings nor the summary (formats full and concise); rows with findings only (format table)'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -s v -l verbose -d 'Explain why each skipped rule was skipped'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -s h -l help -d 'Print help (see more with \'--help\')'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -s V -l version -d 'Print version'
@@ -111,6 +112,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l
 blake3\t'BLAKE3'
 sha256\t'SHA-256'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l output-format -d 'Format of the report on standard output' -r -f -a "full\t''
+table\t''
 concise\t''
 json\t''
 jsonl\t''
@@ -146,6 +148,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l hash -
 blake3\t'BLAKE3'
 sha256\t'SHA-256'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l output-format -d 'Format of the report on standard output' -r -f -a "full\t''
+table\t''
 concise\t''
 json\t''
 jsonl\t''
@@ -178,6 +181,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l hash
 blake3\t'BLAKE3'
 sha256\t'SHA-256'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l output-format -d 'Format of the report on standard output' -r -f -a "full\t''
+table\t''
 concise\t''
 json\t''
 jsonl\t''
@@ -210,6 +214,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l hash 
 blake3\t'BLAKE3'
 sha256\t'SHA-256'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l output-format -d 'Format of the report on standard output' -r -f -a "full\t''
+table\t''
 concise\t''
 json\t''
 jsonl\t''
@@ -240,6 +245,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -
 blake3\t'BLAKE3'
 sha256\t'SHA-256'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l output-format -d 'Format of the report on standard output' -r -f -a "full\t''
+table\t''
 concise\t''
 json\t''
 jsonl\t''
