@@ -163,7 +163,7 @@ pub struct InspectArgs {
     /// Output format
     #[arg(long, alias = "format", value_name = "FMT", default_value = "full")]
     pub output_format: InspectFormat,
-    /// When to print colours; auto respects `NO_COLOR`
+    /// When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`
     #[arg(long, value_name = "WHEN", default_value = "auto")]
     pub color: Color,
 }
@@ -186,7 +186,7 @@ pub struct DiffArgs {
     /// Output format
     #[arg(long, alias = "format", value_name = "FMT", default_value = "full")]
     pub output_format: InspectFormat,
-    /// When to print colours; auto respects `NO_COLOR`
+    /// When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`
     #[arg(long, value_name = "WHEN", default_value = "auto")]
     pub color: Color,
 }
@@ -264,7 +264,7 @@ pub struct ReportArgs {
     /// Exit with 0 even if there are findings
     #[arg(long)]
     pub exit_zero: bool,
-    /// When to print colours; auto respects `NO_COLOR`
+    /// When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`
     #[arg(long, value_name = "WHEN", default_value = "auto")]
     pub color: Color,
 }

@@ -45,14 +45,26 @@ pub fn finish(report: &Report, args: &ReportArgs, counted: bool, quiet: bool) ->
     print(&text)
 }
 
+/// What the environment says of colours; `None` leaves it to the terminal. `NO_COLOR` wins (<https://no-color.org>), and then what
+/// forces colours (<https://force-color.org>, <https://bixense.com/clicolors>).
+fn wants_color() -> Option<bool> {
+    let forced = || std::env::var_os("FORCE_COLOR").is_some_and(|v| !v.is_empty() && v != "0" && v != "false");
+    if anstyle_query::no_color() {
+        return Some(false);
+    }
+    if forced() || anstyle_query::clicolor_force() {
+        return Some(true);
+    }
+    (anstyle_query::clicolor() == Some(false) || !anstyle_query::term_supports_color()).then_some(false)
+}
+
 /// The style for standard output.
 pub fn style(color: Color) -> Style {
     let terminal = std::io::stdout().is_terminal();
     let color = match color {
         Color::Always => true,
         Color::Never => false,
-        // https://no-color.org
-        Color::Auto => terminal && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty()) && system::shows_color(),
+        Color::Auto => wants_color().unwrap_or_else(|| terminal && system::shows_color()),
     };
     Style { color, width: terminal.then(system::columns).flatten(), ..Style::default() }
 }

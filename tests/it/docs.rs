@@ -60,6 +60,7 @@ fn run(command: &str, place: &Path) -> (String, String) {
     let path = env::join_paths([program].into_iter().chain(env::split_paths(&env::var_os("PATH").unwrap()))).unwrap();
     let mut shell = Command::new("sh");
     shell.args(["-c", command]).current_dir(place).env("PATH", path).env("XDG_STATE_HOME", crate::support::state());
+    shell.env_remove("FORCE_COLOR").env_remove("CLICOLOR_FORCE");
     let ran = shell.output().unwrap();
     (String::from_utf8(ran.stdout).unwrap(), String::from_utf8(ran.stderr).unwrap())
 }

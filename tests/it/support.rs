@@ -150,7 +150,7 @@ pub fn state() -> &'static Path {
 /// The program of this build, with [`state`].
 pub fn program() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_ckpt-doctor"));
-    command.env("XDG_STATE_HOME", state());
+    command.env("XDG_STATE_HOME", state()).env_remove("FORCE_COLOR").env_remove("CLICOLOR_FORCE");
     command
 }
 

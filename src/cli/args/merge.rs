@@ -63,7 +63,7 @@ pub struct VerifyArgs {
     /// Output format
     #[arg(long, alias = "format", value_name = "FMT", default_value = "full")]
     pub output_format: InspectFormat,
-    /// When to print colours; auto respects `NO_COLOR`
+    /// When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`
     #[arg(long, value_name = "WHEN", default_value = "auto")]
     pub color: Color,
 }

@@ -134,3 +134,24 @@ fn paths_of_a_merge_file_are_printed_in_their_short_form() {
     assert_eq!(planned(work.path(), "link/merge.json5")["out"], "link/../merged");
     assert_eq!(planned(work.path(), "real/deep/merge.json5")["out"], "real/merged");
 }
+
+/// Standard output is no terminal here, which has no colours unless they are forced.
+#[test]
+fn the_environment_forces_colours_or_forbids_them() {
+    let donor = project().join("fixtures/donors/llava3d-tiny");
+    for (variables, args, is_colored) in [
+        (&[][..], &[][..], false),
+        (&[("FORCE_COLOR", "1")], &[], true),
+        (&[("FORCE_COLOR", "0")], &[], false),
+        (&[("FORCE_COLOR", "")], &[], false),
+        (&[("CLICOLOR_FORCE", "1"), ("TERM", "dumb")], &[], true),
+        (&[("FORCE_COLOR", "1"), ("NO_COLOR", "1")], &[], false),
+        (&[("FORCE_COLOR", "1")], &["--color", "never"], false),
+        (&[("NO_COLOR", "1")], &["--color", "always"], true),
+    ] {
+        let mut command = crate::support::program();
+        command.env_remove("NO_COLOR").envs(variables.iter().copied()).arg("check").arg(&donor).args(args);
+        let shown = command.output().unwrap().stdout;
+        assert_eq!(shown.contains(&b'\x1b'), is_colored, "{variables:?} {args:?}");
+    }
+}

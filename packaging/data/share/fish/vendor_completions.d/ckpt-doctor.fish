@@ -70,7 +70,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l report
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l fail-on -d 'Lowest severity that makes the exit code 1 [default: error]' -r -f -a "info\t'All findings'
 warning\t'Warnings and errors'
 error\t'Errors only'"
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l color -d 'When to print colours; auto respects `NO_COLOR`' -r -f -a "auto\t'On a terminal'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l color -d 'When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`' -r -f -a "auto\t'On a terminal'
 always\t'Always'
 never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l min-severity -d 'Lowest severity that is reported; the exit code depends on --fail-on alone [default: info]' -r -f -a "info\t'All findings'
@@ -125,7 +125,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l fail-on -d 'Lowest severity that makes the exit code 1 [default: error]' -r -f -a "info\t'All findings'
 warning\t'Warnings and errors'
 error\t'Errors only'"
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l color -d 'When to print colours; auto respects `NO_COLOR`' -r -f -a "auto\t'On a terminal'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l color -d 'When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`' -r -f -a "auto\t'On a terminal'
 always\t'Always'
 never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l rules -d 'Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name' -r -F
@@ -161,7 +161,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l report
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l fail-on -d 'Lowest severity that makes the exit code 1 [default: error]' -r -f -a "info\t'All findings'
 warning\t'Warnings and errors'
 error\t'Errors only'"
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l color -d 'When to print colours; auto respects `NO_COLOR`' -r -f -a "auto\t'On a terminal'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l color -d 'When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`' -r -f -a "auto\t'On a terminal'
 always\t'Always'
 never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l rules -d 'Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name' -r -F
@@ -194,7 +194,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l repo
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l fail-on -d 'Lowest severity that makes the exit code 1 [default: error]' -r -f -a "info\t'All findings'
 warning\t'Warnings and errors'
 error\t'Errors only'"
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l color -d 'When to print colours; auto respects `NO_COLOR`' -r -f -a "auto\t'On a terminal'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l color -d 'When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`' -r -f -a "auto\t'On a terminal'
 always\t'Always'
 never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l rules -d 'Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name' -r -F
@@ -227,7 +227,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l repor
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l fail-on -d 'Lowest severity that makes the exit code 1 [default: error]' -r -f -a "info\t'All findings'
 warning\t'Warnings and errors'
 error\t'Errors only'"
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l color -d 'When to print colours; auto respects `NO_COLOR`' -r -f -a "auto\t'On a terminal'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l color -d 'When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`' -r -f -a "auto\t'On a terminal'
 always\t'Always'
 never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l rules -d 'Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name' -r -F
@@ -258,7 +258,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l fail-on -d 'Lowest severity that makes the exit code 1 [default: error]' -r -f -a "info\t'All findings'
 warning\t'Warnings and errors'
 error\t'Errors only'"
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l color -d 'When to print colours; auto respects `NO_COLOR`' -r -f -a "auto\t'On a terminal'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l color -d 'When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`' -r -f -a "auto\t'On a terminal'
 always\t'Always'
 never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l rules -d 'Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name' -r -F
@@ -270,7 +270,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand verify" -l donor -d 'Recompute the tensors that were made from this donor, and compare them byte for byte; may be repeated' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand verify" -l output-format -d 'Output format' -r -f -a "full\t'For a terminal'
 json\t'One JSON object, complete'"
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand verify" -l color -d 'When to print colours; auto respects `NO_COLOR`' -r -f -a "auto\t'On a terminal'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand verify" -l color -d 'When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`' -r -f -a "auto\t'On a terminal'
 always\t'Always'
 never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand verify" -l rules -r -F
@@ -282,7 +282,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l cont
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l batch -d 'Sequences of that cache' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l output-format -d 'Output format' -r -f -a "full\t'For a terminal'
 json\t'One JSON object, complete'"
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l color -d 'When to print colours; auto respects `NO_COLOR`' -r -f -a "auto\t'On a terminal'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l color -d 'When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`' -r -f -a "auto\t'On a terminal'
 always\t'Always'
 never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l rules -d 'Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name' -r -F
@@ -292,7 +292,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l stats -
 rank\t'These, and the rank of the difference'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l output-format -d 'Output format' -r -f -a "full\t'For a terminal'
 json\t'One JSON object, complete'"
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l color -d 'When to print colours; auto respects `NO_COLOR`' -r -f -a "auto\t'On a terminal'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l color -d 'When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`' -r -f -a "auto\t'On a terminal'
 always\t'Always'
 never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l rules -d 'Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name' -r -F
@@ -303,7 +303,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l stat
 rank\t'These, and the rank of the difference'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l output-format -d 'Output format' -r -f -a "full\t'For a terminal'
 json\t'One JSON object, complete'"
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l color -d 'When to print colours; auto respects `NO_COLOR`' -r -f -a "auto\t'On a terminal'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l color -d 'When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`' -r -f -a "auto\t'On a terminal'
 always\t'Always'
 never\t'Never'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l rules -d 'Directory with extra rules (checks/**/*.json5), architectures (architectures/*.json5), processors (processors/*.json5) and recipes (recipes/*.json5); except for rules, a file replaces the built-in one of the same name' -r -F
