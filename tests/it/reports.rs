@@ -44,6 +44,8 @@ fn several_checkpoints() {
         assert!(table.iter().all(|line| line.chars().count() <= width), "{shown}");
         snapshot!(format!("report-zoo-table-{width}"), table.join("\n"));
     }
+    let colored = render(&samples::zoo(), Format::Table, Style { color: true, ..PLAIN });
+    snapshot!("report-zoo-table-colored", colored.replace('\x1b', "␛"));
 }
 
 #[test]

@@ -6,6 +6,7 @@ use comfy_table::{CellAlignment, Table, presets};
 
 use super::super::Style;
 use super::super::format::{bytes, name, scaled};
+use super::super::model::Verdict;
 use super::super::overview::{Overview, OverviewRow};
 use super::paint::Paint;
 use crate::check::verdict::LoadVerdict;
@@ -41,10 +42,30 @@ pub fn render(out: &mut String, overview: &Overview<'_>, style: Style) {
         }
     }
     let paint = Paint(style.color);
-    for (n, line) in table.lines().enumerate() {
-        let line = line.trim_end();
-        let _ok = writeln!(out, "{}", if n == 0 { paint.strong(line) } else { line.to_owned() });
+    let mut lines = table.lines();
+    if let Some(header) = lines.next() {
+        let _ok = writeln!(out, "{}", paint.strong(header.trim_end()));
     }
+    for (line, row) in lines.zip(&overview.rows) {
+        let _ok = writeln!(out, "{}", colored(line.trim_end(), &row.verdicts, paint));
+    }
+}
+
+/// A line of the table with its verdicts in colour. They are the last words of it, before two numbers.
+fn colored(line: &str, verdicts: &[Option<LoadVerdict>], paint: Paint) -> String {
+    let (mut head, mut tail) = (line, String::new());
+    for verdict in verdicts.iter().rev().flatten() {
+        let word = short(Some(*verdict));
+        let Some((before, after)) = head.rsplit_once(word) else { break };
+        let word = match verdict {
+            LoadVerdict::Loads => paint.verdict(Verdict::Clean, word),
+            LoadVerdict::NotPredicted => paint.quiet(word),
+            LoadVerdict::LoadsWrong | LoadVerdict::Raises => paint.verdict(Verdict::Error, word),
+        };
+        tail = format!("{word}{after}{tail}");
+        head = before;
+    }
+    format!("{head}{tail}")
 }
 
 /// The cells after the names.
