@@ -12,15 +12,19 @@ use super::args::Cli;
 /// offered.
 const COMMANDS: [(&[&str], Option<&str>); 13] = [
     (
-        &["analyse", "analyze", "audit", "diagnose", "doctor", "examine", "lint", "scan", "test", "validate", "zoo"],
+        &[
+            "analyse", "analyze", "audit", "diagnose", "doctor", "examine", "lint", "load", "loads", "scan", "test",
+            "validate", "zoo",
+        ],
         Some("check"),
     ),
     (&["fix", "format", "heal", "repair"], Some("check --fix")),
     (&["cmp", "delta"], Some("diff")),
     (
         &[
-            "cat", "describe", "dump", "header", "headers", "info", "keys", "list", "ls", "print", "shapes", "show",
-            "stats", "summary", "tensors", "tree", "view",
+            "cat", "describe", "dump", "estimate", "head", "header", "headers", "info", "keys", "list", "ls", "mem",
+            "memory", "params", "print", "shapes", "show", "size", "stat", "stats", "summary", "tensors", "tree",
+            "view", "vram",
         ],
         Some("inspect"),
     ),

@@ -79,6 +79,8 @@ fn words_that_people_type_lead_to_the_right_command() {
         "swap",
         "revert",
         "why",
+        "memory",
+        "load",
         "settings",
         "version",
         "convert",
