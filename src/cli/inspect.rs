@@ -2,13 +2,15 @@
 
 use crate::checkpoint::files;
 use std::path::Path;
+use std::sync::Arc;
 
 use anyhow::{Context, bail};
 
 use super::args::{InspectArgs, InspectFormat};
 use super::exit::CLEAN;
 use super::{library, output, paths};
-use crate::check::inspect::{CacheInput, InspectedTensor, inspect, tensors};
+use crate::check::check;
+use crate::check::inspect::{CacheInput, InspectedTensor, Inspection, inspect, tensors};
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, Parts, Shard, find_checkpoints};
 use crate::knowledge::directories::Directories;
@@ -17,11 +19,19 @@ use crate::report::inspect as report;
 /// Runs `inspect`.
 pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let path = &args.path;
-    let checkpoint = open(path)?;
+    let checkpoint = Arc::new(open(path)?);
     let listed = args.tensors.as_ref().map(|glob| list(&checkpoint, path, glob)).transpose()?;
     let name = shown(path);
     let cache = CacheInput { context: args.context, batch: args.batch };
-    let inspection = |rules| anyhow::Ok(inspect(&checkpoint, &library::with(rules)?, cache));
+    let inspection = |rules: Option<&Path>| {
+        let knowledge = library::knowledge(library::rules(rules)?, rules)?;
+        let inspection = inspect(&checkpoint, &knowledge.library, cache);
+        let is_model = [files::CONFIG, files::INDEX, files::ADAPTER_CONFIG]
+            .iter()
+            .any(|name| checkpoint.entries.contains_key(*name));
+        let loads = if is_model { check(&checkpoint, &knowledge).verdicts } else { Vec::new() };
+        anyhow::Ok(Inspection { loads, ..inspection })
+    };
     output::print(&match (args.output_format, listed) {
         (InspectFormat::Full, Some(listed)) => report::tensors(&listed),
         (InspectFormat::Full, None) => report::full(&name, &inspection(rules)?, args.depth, output::style(args.color)),

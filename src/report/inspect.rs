@@ -9,7 +9,7 @@ use serde::Serialize;
 
 use self::columns::{Align, WIDTH, columns};
 use super::Style;
-use super::format::{and, bytes, more, name, plural, scaled, sentence, shape, wrap};
+use super::format::{and, bytes, headline, more, name, objects, plural, scaled, sentence, shape, wrap};
 use super::json::pretty;
 use super::model::ToolInfo;
 use super::terminal::load::table;
@@ -68,6 +68,11 @@ pub fn full(path: &str, inspection: &Inspection, levels: Option<usize>, style: S
         count(all.parameters),
         bytes(all.bytes)
     );
+    if !inspection.loads.is_empty() {
+        for line in [headline(&inspection.loads)].into_iter().chain(objects(&inspection.loads)) {
+            prose(&mut out, &line, style);
+        }
+    }
     amounts(&mut out, "dtypes", &inspection.dtypes, style);
     tree::render(&mut out, &inspection.tree, levels, style);
     files(&mut out, inspection, style);
