@@ -11,6 +11,7 @@ use ckpt_doctor::checkpoint::Checkpoint;
 use ckpt_doctor::checkpoint::journal::{InodeIdentity, Journal};
 use ckpt_doctor::surgery::repair::{Content, Repair, plan};
 use ckpt_doctor::surgery::{FileChange, Recovered, RepairError, Trust, journal, overlay};
+use sha2::{Digest as _, Sha256};
 use tempfile::TempDir;
 
 use super::seen;
@@ -223,6 +224,11 @@ fn a_header_is_edited_in_place() {
     let name = "model-00001-of-00002.safetensors";
     let (old, new) = (&before[name].3, &after[name].3);
     assert!(old.len() == new.len() && old != new);
+    let journal: serde_json::Value =
+        serde_json::from_slice(&fs::read(folder.join("undo/1.json")).expect("a journal")).expect("JSON");
+    let header = 8 + usize::try_from(u64::from_le_bytes(new[..8].try_into().expect("eight bytes"))).expect("a length");
+    let digest = ckpt_doctor::checkpoint::hex(&Sha256::digest(&new[..header]));
+    assert_eq!(journal["files"][0]["new"], serde_json::json!({ "len": new.len(), "sha256": digest }));
     assert!(fs::metadata(folder.join("undo/1").join(name)).expect("both headers").len() < old.len() as u64);
     journal::undo(&dir, &support::own()).expect("undone");
     assert_eq!(seen(&dir), before);
