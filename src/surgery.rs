@@ -29,7 +29,9 @@ pub use error::{ApplyError, RepairError};
 pub use leftover::Leftover;
 #[cfg(feature = "internals")]
 pub use outcome::FileChange;
-pub use outcome::{Recovered, Recovery, RepairWritten, Target};
+pub use outcome::{Recovered, Recovery, RepairWritten, Target, Undone};
+#[cfg(feature = "cli")]
+pub(crate) use stop::interrupted;
 pub use stop::stop_on;
 pub use trust::Trust;
 pub use writers::{CAN_WRITE, apply, check_target, claim_target, free_space, journal, overlay};

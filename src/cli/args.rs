@@ -34,7 +34,7 @@ pub struct Cli {
 pub enum Command {
     /// Check checkpoint directories; with --fix, repair them
     Check(CheckArgs),
-    /// Undo the latest repair of a checkpoint, byte for byte
+    /// Undo the latest repair of each checkpoint, byte for byte
     Undo(UndoArgs),
     /// Build one checkpoint from parts of two others
     #[command(visible_alias = "merge")]
@@ -395,11 +395,11 @@ pub struct FixArgs {
 yours, or a file has changed since the repair"
 )]
 pub struct UndoArgs {
-    /// The checkpoint that `check --fix` repaired
-    #[arg(value_name = "DIR", default_value = ".")]
-    pub path: PathBuf,
+    /// Checkpoints that `check --fix` repaired, or directories that contain them
+    #[arg(value_name = "PATH", default_value = ".")]
+    pub paths: Vec<PathBuf>,
     /// Also undo a repair that you did not make in this directory, such as one in a copy. Its journal decides which files are
-    /// written, so know where the directory comes from
+    /// written, so know where the directory comes from. For one checkpoint alone
     #[arg(long)]
     pub adopt_journal: bool,
 }

@@ -16,7 +16,7 @@ pub fn stop_on(signal: Arc<AtomicUsize>) {
 }
 
 /// Fails when a signal arrived.
-pub(super) fn interrupted() -> Result<(), ApplyError> {
+pub(crate) fn interrupted() -> Result<(), ApplyError> {
     match SIGNAL.get() {
         Some(signal) if signal.load(Ordering::Relaxed) != 0 => Err(ApplyError::Interrupted),
         _ => Ok(()),

@@ -1,5 +1,6 @@
 //! `check --fix` and `undo` from the outside.
 
+use std::fs;
 use std::path::Path;
 
 use serde_json::Value;
@@ -19,7 +20,7 @@ fn broken() -> TempDir {
       { remove: "tokenizer.json" },
     ]"#;
     let dir = support::made("llama-sharded", changes, room.path());
-    std::fs::rename(dir, room.path().join("model")).expect("a rename");
+    fs::rename(dir, room.path().join("model")).expect("a rename");
     room
 }
 
@@ -93,4 +94,34 @@ fn plain_check_writes_nothing() {
     doctor(room.path(), &["check", "model"]);
     doctor(room.path(), &["check", "model", "--unsafe-fixes"]);
     assert!(!room.path().join("model/.ckpt-doctor").exists());
+}
+
+#[test]
+fn undo_takes_the_paths_of_check() {
+    let room = broken();
+    let other = broken();
+    fs::rename(other.path().join("model"), room.path().join("other")).expect("a rename");
+    let whole = |dir: &str| seen(&room.path().join(dir));
+    let before = (whole("model"), whole("other"));
+    let mut session = String::new();
+    let mut run = |args: &[&str]| {
+        let (code, text) = doctor(room.path(), args);
+        session.push_str(&format!("$ ckpt-doctor {}\n{text}exit code {code}\n\n", args.join(" ")));
+    };
+    let fix = |dirs: &[&str]| {
+        let (code, text) = doctor(room.path(), &[&["check", "--fix-only"], dirs].concat());
+        assert_eq!(code, 0, "{text}");
+    };
+    fix(&["."]);
+    run(&["undo"]);
+    assert_eq!((whole("model"), whole("other")), before);
+    run(&["undo"]);
+    run(&["undo", "model", "missing"]);
+
+    fix(&["model", "other"]);
+    run(&["undo", ".", "--adopt-journal"]);
+    fs::write(room.path().join("model/generation_config.json"), "{}").expect("a file");
+    run(&["undo", "model", ".", "other/config.json"]);
+    assert_eq!(whole("other"), before.1);
+    snapshot!("fix-undo-several", session);
 }

@@ -28,7 +28,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_needs_command" -l rules -d 'Direc
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_needs_command" -s h -l help -d 'Print help'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_needs_command" -s V -l version -d 'Print version'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_needs_command" -f -a "check" -d 'Check checkpoint directories; with --fix, repair them'
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_needs_command" -f -a "undo" -d 'Undo the latest repair of a checkpoint, byte for byte'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_needs_command" -f -a "undo" -d 'Undo the latest repair of each checkpoint, byte for byte'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_needs_command" -f -a "build-merged" -d 'Build one checkpoint from parts of two others'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_needs_command" -f -a "merge" -d 'Build one checkpoint from parts of two others'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_needs_command" -f -a "extract" -d 'Take a part out of a model, as a checkpoint of its own class'
@@ -96,7 +96,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -s v -l v
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -s h -l help -d 'Print help (see more with \'--help\')'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -s V -l version -d 'Print version'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand undo" -l rules -r -F
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand undo" -l adopt-journal -d 'Also undo a repair that you did not make in this directory, such as one in a copy. Its journal decides which files are written, so know where the directory comes from'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand undo" -l adopt-journal -d 'Also undo a repair that you did not make in this directory, such as one in a copy. Its journal decides which files are written, so know where the directory comes from. For one checkpoint alone'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand undo" -s h -l help -d 'Print help'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand undo" -s V -l version -d 'Print version'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l recipe -d 'Name of a recipe (see `ckpt-doctor recipes`), or a JSON5 file' -r
@@ -343,7 +343,7 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand man" -l rules -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand man" -s h -l help -d 'Print help'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand man" -s V -l version -d 'Print version'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand help; and not __fish_seen_subcommand_from check undo build-merged extract insert merge-adapter verify inspect diff expect explain rules recipes init completions man help" -f -a "check" -d 'Check checkpoint directories; with --fix, repair them'
-complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand help; and not __fish_seen_subcommand_from check undo build-merged extract insert merge-adapter verify inspect diff expect explain rules recipes init completions man help" -f -a "undo" -d 'Undo the latest repair of a checkpoint, byte for byte'
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand help; and not __fish_seen_subcommand_from check undo build-merged extract insert merge-adapter verify inspect diff expect explain rules recipes init completions man help" -f -a "undo" -d 'Undo the latest repair of each checkpoint, byte for byte'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand help; and not __fish_seen_subcommand_from check undo build-merged extract insert merge-adapter verify inspect diff expect explain rules recipes init completions man help" -f -a "build-merged" -d 'Build one checkpoint from parts of two others'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand help; and not __fish_seen_subcommand_from check undo build-merged extract insert merge-adapter verify inspect diff expect explain rules recipes init completions man help" -f -a "extract" -d 'Take a part out of a model, as a checkpoint of its own class'
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand help; and not __fish_seen_subcommand_from check undo build-merged extract insert merge-adapter verify inspect diff expect explain rules recipes init completions man help" -f -a "insert" -d 'Put a part into a model, such as a language model that was trained on text alone'
