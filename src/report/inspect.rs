@@ -59,15 +59,15 @@ pub fn full(path: &str, inspection: &Inspection, levels: Option<usize>, style: S
     let paint = Paint(style.color);
     let mut out = String::new();
     let all = inspection.tensors;
-    let _ok = writeln!(
-        out,
-        "{}: {}, {}, {} parameters, {}",
-        paint.strong(&name(path)),
+    let subject = name(path);
+    let line = format!(
+        "{subject}: {}, {}, {} parameters, {}",
         plural(inspection.files.len(), "file"),
         plural(all.tensors, "tensor"),
         count(all.parameters),
         bytes(all.bytes)
     );
+    let _ok = writeln!(out, "{}", wrap(&line, style.width).replacen(&subject, &paint.strong(&subject), 1));
     if !inspection.loads.is_empty() {
         for line in [headline(&inspection.loads)].into_iter().chain(objects(&inspection.loads)) {
             prose(&mut out, &line, style);
