@@ -201,6 +201,8 @@ fn nothing_stored_is_no_prediction() {
     let inputs = case.inputs();
     let predictions = predict(&inputs, build_classes(&inputs, resolve_targets(&inputs)));
     assert!(predictions.iter().all(|prediction| prediction.report.is_none()));
+    let why = classes::unpredicted(&inputs, &build_classes(&inputs, resolve_targets(&inputs)));
+    assert!(!why.is_empty() && why.iter().all(|(_, why)| why == "no tensor was read"), "{why:?}");
 }
 
 #[test]
