@@ -10,7 +10,6 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 
 use super::load::{self, Stored};
-use super::verdict::PredictedLoad;
 use super::votes::{self, Fit, Votes, vote};
 use crate::checkpoint::{Checkpoint, Tensor, pointer};
 use crate::knowledge::resemblance::Resemblance;
@@ -51,9 +50,6 @@ pub struct Inspection {
     pub proven: Value,
     /// The memory that the class takes with the values of config.json; null for an unknown class, and for quantised weights.
     pub memory: Option<Memory>,
-    /// What each version of transformers does with it, as `check` says; empty without a config, an index or an adapter's config.
-    /// [`inspect`] leaves it empty, and the program fills it in.
-    pub loads: Vec<PredictedLoad>,
     /// Why parts of the summary are missing.
     pub notes: Vec<String>,
 }
@@ -153,7 +149,6 @@ pub fn inspect(checkpoint: &Checkpoint, library: &Library, cache: CacheInput) ->
         votes: None,
         proven: Value::Null,
         memory: None,
-        loads: Vec::new(),
         notes: Vec::new(),
     };
     let mut stored = Stored::of(checkpoint);

@@ -10,7 +10,7 @@ use super::args::{InspectArgs, InspectFormat};
 use super::exit::CLEAN;
 use super::{library, output, paths};
 use crate::check::check;
-use crate::check::inspect::{CacheInput, InspectedTensor, Inspection, inspect, tensors};
+use crate::check::inspect::{CacheInput, InspectedTensor, inspect, tensors};
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, Parts, Shard, find_checkpoints};
 use crate::knowledge::directories::Directories;
@@ -23,19 +23,23 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let listed = args.tensors.as_ref().map(|glob| list(&checkpoint, path, glob)).transpose()?;
     let name = shown(path);
     let cache = CacheInput { context: args.context, batch: args.batch };
-    let inspection = |rules: Option<&Path>| {
+    let judged = |rules: Option<&Path>| {
         let knowledge = library::knowledge(library::rules(rules)?, rules)?;
-        let inspection = inspect(&checkpoint, &knowledge.library, cache);
-        let is_model = [files::CONFIG, files::INDEX, files::ADAPTER_CONFIG]
-            .iter()
-            .any(|name| checkpoint.entries.contains_key(*name));
+        let has = |name: &str| checkpoint.entries.contains_key(name);
+        let is_model = [files::CONFIG, files::INDEX, files::ADAPTER_CONFIG].into_iter().any(has);
         let loads = if is_model { check(&checkpoint, &knowledge).verdicts } else { Vec::new() };
-        anyhow::Ok(Inspection { loads, ..inspection })
+        anyhow::Ok((inspect(&checkpoint, &knowledge.library, cache), loads))
     };
     output::print(&match (args.output_format, listed) {
         (InspectFormat::Full, Some(listed)) => report::tensors(&listed),
-        (InspectFormat::Full, None) => report::full(&name, &inspection(rules)?, args.depth, output::style(args.color)),
-        (InspectFormat::Json, listed) => report::json(&name, &inspection(rules)?, listed.as_deref()),
+        (InspectFormat::Full, None) => {
+            let (inspection, loads) = judged(rules)?;
+            report::full(&name, &inspection, &loads, args.depth, output::style(args.color))
+        }
+        (InspectFormat::Json, listed) => {
+            let (inspection, loads) = judged(rules)?;
+            report::json(&name, &inspection, &loads, listed.as_deref())
+        }
     })?;
     Ok(CLEAN)
 }

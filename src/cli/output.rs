@@ -66,7 +66,12 @@ pub fn style(color: Color) -> Style {
         Color::Never => false,
         Color::Auto => wants_color().unwrap_or_else(|| terminal && system::shows_color()),
     };
-    Style { color, width: terminal.then(system::columns).flatten(), ..Style::default() }
+    Style { color, width: width(), ..Style::default() }
+}
+
+/// Columns of the terminal at standard output; `None` without one.
+pub fn width() -> Option<usize> {
+    std::io::stdout().is_terminal().then(system::columns).flatten()
 }
 
 /// Prints to standard output.

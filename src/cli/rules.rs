@@ -6,7 +6,7 @@ use std::path::Path;
 use anyhow::bail;
 use comfy_table::{ContentArrangement, Row, Table, presets};
 
-use super::args::{Color, ExplainArgs, SettingsArgs};
+use super::args::{ExplainArgs, SettingsArgs};
 use super::exit::CLEAN;
 use super::output;
 use super::settings::{Typed, resolve};
@@ -29,7 +29,7 @@ pub fn explain(args: &ExplainArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let here = resolve(&Typed::new(&args.settings, rules), &Surroundings::new([]))?;
     let rules = &here.knowledge.rules;
     let words = args.words.join(" ");
-    let width = output::style(Color::Never).width;
+    let width = output::width();
     let recipe = here.knowledge.recipes.iter().find(|recipe| recipe.recipe == words);
     let text = match (recipe, family(rules, &words, width)) {
         (Some(recipe), _) => recipes::page(recipe),

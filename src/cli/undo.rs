@@ -1,5 +1,6 @@
 //! `undo`.
 
+use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
@@ -30,7 +31,7 @@ pub fn run(args: &UndoArgs) -> anyhow::Result<u8> {
 /// The checkpoints of these paths that a repair has changed; the paths themselves if there is none.
 fn repaired(given: &[PathBuf]) -> anyhow::Result<Vec<PathBuf>> {
     let has_repair = |dir: &PathBuf| dir.join(REPAIR_FOLDER).symlink_metadata().is_ok();
-    let mut dirs: Vec<PathBuf> = Vec::new();
+    let (mut dirs, mut seen) = (Vec::new(), BTreeSet::new());
     for path in given {
         let found = paths::targets(std::slice::from_ref(path), true)?.dirs;
         // A directory may have lost what made it a checkpoint.
@@ -38,17 +39,9 @@ fn repaired(given: &[PathBuf]) -> anyhow::Result<Vec<PathBuf>> {
         if found.is_empty() {
             found.push(path.clone());
         }
-        for dir in found {
-            if !dirs.iter().any(|other| is_same(other, &dir)) {
-                dirs.push(dir);
-            }
-        }
+        dirs.extend(found.into_iter().filter(|dir| seen.insert(dir.canonicalize().unwrap_or_else(|_| dir.clone()))));
     }
     Ok(dirs)
-}
-
-fn is_same(a: &Path, b: &Path) -> bool {
-    a == b || a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b))
 }
 
 /// Undoes the latest repair of each. Fails if one of them cannot be undone, after the others.

@@ -15,6 +15,7 @@ use super::model::ToolInfo;
 use super::terminal::load::table;
 use super::terminal::paint::Paint;
 use crate::check::inspect::{Amount, ClassCandidate, InspectedTensor, Inspection, Memory};
+use crate::check::verdict::PredictedLoad;
 use crate::check::votes::{Vote, Votes};
 
 #[derive(Serialize)]
@@ -25,6 +26,8 @@ pub(crate) struct InspectDocument<'a> {
     path: &'a str,
     #[serde(flatten)]
     inspection: &'a Inspection,
+    /// What each version of transformers does with it, as `check` says; empty without a config, an index or an adapter's config.
+    loads: &'a [PredictedLoad],
     /// The tensors, with `--tensors`.
     #[serde(skip_serializing_if = "Option::is_none")]
     tensor_list: Option<&'a [InspectedTensor]>,
@@ -32,8 +35,13 @@ pub(crate) struct InspectDocument<'a> {
 
 /// A complete inspection as JSON, with a list of tensors if there is one.
 #[must_use]
-pub fn json(path: &str, inspection: &Inspection, tensor_list: Option<&[InspectedTensor]>) -> String {
-    pretty(&InspectDocument { schema: 2, tool: ToolInfo::this(), path, inspection, tensor_list })
+pub fn json(
+    path: &str,
+    inspection: &Inspection,
+    loads: &[PredictedLoad],
+    tensor_list: Option<&[InspectedTensor]>,
+) -> String {
+    pretty(&InspectDocument { schema: 2, tool: ToolInfo::this(), path, inspection, loads, tensor_list })
 }
 
 /// A list of tensors for a terminal, one per line.
@@ -55,7 +63,13 @@ pub fn tensors(list: &[InspectedTensor]) -> String {
 
 /// An inspection for a terminal, with `levels` of the tree of modules; without a number, with as many as stay short.
 #[must_use]
-pub fn full(path: &str, inspection: &Inspection, levels: Option<usize>, style: Style) -> String {
+pub fn full(
+    path: &str,
+    inspection: &Inspection,
+    loads: &[PredictedLoad],
+    levels: Option<usize>,
+    style: Style,
+) -> String {
     let paint = Paint(style.color);
     let mut out = String::new();
     let all = inspection.tensors;
@@ -68,8 +82,8 @@ pub fn full(path: &str, inspection: &Inspection, levels: Option<usize>, style: S
         bytes(all.bytes)
     );
     let _ok = writeln!(out, "{}", wrap(&line, style.width).replacen(&subject, &paint.strong(&subject), 1));
-    if !inspection.loads.is_empty() {
-        for line in [headline(&inspection.loads)].into_iter().chain(objects(&inspection.loads)) {
+    if !loads.is_empty() {
+        for line in [headline(loads)].into_iter().chain(objects(loads)) {
             prose(&mut out, &line, style);
         }
     }

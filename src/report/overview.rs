@@ -6,8 +6,7 @@ use super::format::worst_first;
 use super::model::{CheckpointReport, Report};
 use crate::check::verdict::LoadVerdict;
 
-/// The table of a run, a row for each checkpoint: `full` and `markdown` start with it if there are several, and `table` is nothing
-/// else.
+/// The table of a run, a row for each checkpoint: `full` and `markdown` start with it if there are several, and `table` always.
 pub struct Overview<'a> {
     /// Versions of transformers of the run, ascending: the loaders that were modelled.
     pub loaders: Vec<&'a str>,

@@ -208,7 +208,7 @@ fn inspect_fits_a_narrow_terminal() {
     let checkpoint = Checkpoint::open(work.path().join("spatialvla-tiny")).unwrap();
     let inspection = inspect(&checkpoint, &Library::embedded(), CACHE);
     let style = Style { width: Some(80), cap: 8, ..Style::default() };
-    let shown = full("spatialvla-tiny", &inspection, Some(1), style);
+    let shown = full("spatialvla-tiny", &inspection, &[], Some(1), style);
     let below = shown.find("  class by config").unwrap();
     snapshot!("inspect-narrow", without_others(&shown[below..], "full"));
 }

@@ -331,7 +331,7 @@ fn numbers(path: &Path) -> Result<Vec<u32>, RepairError> {
     Ok(numbers)
 }
 
-/// Refuses symbolic links in place of folders: through them, a checkpoint from elsewhere could move files outside it.
+/// Refuses files and symbolic links in place of folders: through a link, a checkpoint from elsewhere could move files outside it.
 fn only_folders(path: &Path) -> Result<(), RepairError> {
     let is_there = |folder: &Path| match look(folder)? {
         Some(meta) if !meta.is_dir() => {
