@@ -14,7 +14,7 @@ use crate::check::load::targets;
 use crate::check::options::RunOptions;
 use crate::check::{Finding, Outcome, Severity, check_for};
 use crate::checkpoint::{Checkpoint, HashAlgorithm, files};
-use crate::knowledge::Knowledge;
+use crate::knowledge::{Knowledge, Loader};
 use crate::knowledge::parts::ModelParts;
 use crate::knowledge::recipe::Recipe;
 use crate::report::Report;
@@ -145,7 +145,10 @@ impl MergeRun {
         let config = planned.document(files::CONFIG).and_then(|document| document.value.as_ref());
         let classes =
             config.map(|config| targets(&knowledge.library, config, &names, &self.versions)).unwrap_or_default();
-        let host = classes.iter().find_map(|(_, class)| ModelParts::of(&knowledge.parts, class.name(), config?));
+        // Processors of all versions have the same turn, so that a class is enough that another version has.
+        let named = |loader| Some(knowledge.library.find(config?, names.iter().copied(), loader)?.name());
+        let known = classes.iter().map(|(_, class)| class.name()).chain(Loader::ALL.into_iter().filter_map(named));
+        let host = known.into_iter().find_map(|name| ModelParts::of(&knowledge.parts, name, config?));
         record.prompt = self.usage.prompt(host.and_then(|model| model.image_turn.as_deref()));
         if let Some(training) = &mut record.training {
             name_in_models(training, planned, &classes);

@@ -126,6 +126,7 @@ class Language(Cell):
     """`swap-language-model`: one host with the language model of a guest."""
 
     what = "language"
+    scale = "keep"
 
     def __init__(self, host, guest, variant):
         self.host = self.row = host
@@ -134,14 +135,23 @@ class Language(Cell):
         width += 16 if host == SPATIALVLA else 0  # of the fixture's width, 48, or wider
         self.donors = (("host", host, WIDTH, host_dtype), ("guest", guest, width, guest_dtype))
         self.name = f"{host} x {guest} {variant}"
+        self.version = None
+
+    def saved_by(self, version):
+        """The same pair for one version of transformers, which saved both donors."""
+        cell = Language(self.host, self.column, self.variant)
+        cell.version = version
+        cell.name += f" for {version}"
+        return cell
 
     def words(self):
         self.host_dir, self.guest_dir = map(self.path, self.donors)
         self.part_dir = self.guest_dir
         options = ["--set", f"projector={self.projector}"] if self.projector else []
         # One result is opened by every version, although some scale image features.
-        options += [] if self.host == SPATIALVLA else ["--set", "scale=keep"]
+        options += [] if self.host == SPATIALVLA and self.scale == "keep" else ["--set", f"scale={self.scale}"]
         options += ["--dry-run"] if self.host == OPENVLA else []
+        options += ["--for", self.version] if self.version else []
         return ["build-merged", "--vision", self.host_dir, "--language", self.guest_dir, "--out", self.out, *options]
 
     def may_change(self, name):
@@ -152,15 +162,12 @@ class AsText(Language):
     """`swap-language-model` with `scale=text` for one version, which opened.py measures in it."""
 
     what = "as text"
+    scale = "text"
 
     def __init__(self, host, guest, variant, version):
         super().__init__(host, guest, variant)
         self.version = version
         self.name += " as text"
-
-    def words(self):
-        words = [word for word in super().words() if word != "scale=keep"]
-        return [*words, *(() if words[-1] == "--set" else ("--set",)), "scale=text", "--for", self.version]
 
     def line(self):
         return json.dumps({**json.loads(super().line()), "version": self.version})

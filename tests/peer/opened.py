@@ -154,7 +154,6 @@ def lines_of(path):
 
 def follow(model, processor, path):
     """The lines of the report ask about a picture, and train what the report counts: of tensors with new rows, these alone."""
-
     lines, wrong = lines_of(path), []
     names = {"model": model, "processor": processor}
     (question,) = lines["Ask about a picture"]
@@ -162,6 +161,8 @@ def follow(model, processor, path):
         picture().save(file)
         file.flush()
         exec(question.replace('"picture.png"', repr(file.name)), names)
+    if "The names are those in the files" in (Path(path) / "merge-report.md").read_text():
+        return wrong  # the report does not know what this version calls them
     for block in lines["Training"]:
         exec(block, names)
     trained = {name: p for name, p in model.named_parameters() if p.requires_grad}
