@@ -171,3 +171,25 @@ fn unread_block(config: &Value, at: &str, depth: usize) -> Option<String> {
     }
     object.iter().find_map(|(key, value)| unread_block(value, &pointer::join(at, key), depth.saturating_sub(1)))
 }
+
+#[cfg(test)]
+mod tests {
+    use serde_json::{Value, json};
+
+    use super::{UNREAD_DEPTH, unread_block};
+
+    #[test]
+    fn a_block_is_found_in_compositions_and_not_below_them() {
+        let nested = |levels| {
+            let block = json!({ "quantization_config": {} });
+            (0..levels).fold(block, |inner, _| json!({ "text_config": inner }))
+        };
+        let found = |config: &Value| unread_block(config, "", UNREAD_DEPTH);
+        assert_eq!(found(&nested(0)).as_deref(), Some("/quantization_config"));
+        assert_eq!(found(&nested(1)).as_deref(), Some("/text_config/quantization_config"));
+        let deep = nested(UNREAD_DEPTH - 1);
+        assert_eq!(found(&deep), Some(format!("{}/quantization_config", "/text_config".repeat(UNREAD_DEPTH - 1))));
+        assert_eq!(found(&nested(UNREAD_DEPTH)), None);
+        assert_eq!(found(&json!({ "quantization_config": null })), None);
+    }
+}

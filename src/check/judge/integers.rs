@@ -35,12 +35,15 @@ pub(super) fn fault(inputs: &Inputs<'_>, loads: &[ExplainedLoad<'_>]) -> Option<
     (!fault.loaders.is_empty()).then_some(fault)
 }
 
-/// Weights and biases of the class that are stored as integers. Buffers have other names, or masks of more dimensions.
+/// Weights and biases of the class that are stored as integers.
 fn integers<'c>(checkpoint: &'c Checkpoint, stored: &Stored, expected: &Expected) -> Vec<(&'c str, Dtype)> {
-    let is_parameter =
-        |name: &str, shape: &[u64]| name.ends_with("weight") || (name.ends_with("bias") && shape.len() == 1);
     let found = loaded(checkpoint, stored, expected).filter(|tensor| tensor.dtype.is_integer());
     found.filter(|tensor| is_parameter(&tensor.name, &tensor.shape)).map(|t| (t.name.as_str(), t.dtype)).collect()
+}
+
+/// Whether a tensor is one that is trained. Buffers have other names, or masks of more dimensions.
+fn is_parameter(name: &str, shape: &[u64]) -> bool {
+    name.ends_with("weight") || (name.ends_with("bias") && shape.len() == 1)
 }
 
 /// Stored tensors of the names that the class has, with its prefix or without. Called for the types that a loader keeps.
@@ -63,4 +66,17 @@ pub(super) fn loaded<'c>(
 pub(super) fn assigns(checkpoint: &Checkpoint, expected: &Expected) -> bool {
     let first = expected.tensors.keys().find_map(|name| index::opened_tensor(checkpoint, name));
     expected.loader != Loader::V4_47_0 || first.is_some_and(|(_, tensor)| tensor.dtype == Dtype::F32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::is_parameter;
+
+    #[test]
+    fn masks_and_counters_are_no_parameters() {
+        assert!(is_parameter("h.0.attn.c_attn.weight", &[4, 12]));
+        assert!(is_parameter("h.0.attn.c_attn.bias", &[12]));
+        assert!(!is_parameter("h.0.attn.bias", &[1, 1, 8, 8]));
+        assert!(!is_parameter("bn.num_batches_tracked", &[]));
+    }
 }

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use serde_json::Map;
 
 use super::*;
+use crate::check::load::wanted;
 use crate::checkpoint::{Fault, FaultKind, Shard};
 use crate::knowledge::rule::Severity;
 
@@ -221,4 +222,16 @@ fn weights_or_an_index_offer_a_model_without_a_config() {
     assert!(offered(&checkpoint).contains(&Model), "an index");
     checkpoint.index = None;
     assert!(!offered(&checkpoint).contains(&Model));
+}
+
+#[test]
+fn the_worst_known_verdict_of_an_object_is_that_of_the_directory() {
+    let targets = wanted(None, &[LOADER.to_owned()]);
+    let of = |case: Case| case.basis().verdicts(&targets, &[]).remove(0).verdict;
+    let sound = || Case::new().report(LoadReport::default());
+    // The tokenizer is not predicted.
+    assert_eq!(of(sound()), LoadVerdict::Loads);
+    assert_eq!(of(sound().finding("A", &[(Tokenizer, LOADER, Raises, "E")])), LoadVerdict::Raises);
+    assert_eq!(of(Case::new().finding("A", &[(Tokenizer, LOADER, Wrong, "w")])), LoadVerdict::LoadsWrong);
+    assert_eq!(of(Case::new()), LoadVerdict::NotPredicted);
 }
