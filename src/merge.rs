@@ -42,6 +42,7 @@ mod usage;
 mod validate;
 #[cfg(feature = "cli")]
 mod verify;
+mod word_fit;
 
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};

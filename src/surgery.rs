@@ -21,6 +21,7 @@ pub mod tensor_ref;
 pub mod transform;
 mod trust;
 pub mod values;
+pub mod word_map;
 #[cfg_attr(not(unix), path = "surgery/unwritable.rs")]
 mod writers;
 pub mod written;

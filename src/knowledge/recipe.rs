@@ -27,11 +27,14 @@ pub use files::{CopySpec, FileSpec, ModulesSpec, TemplateSpec, TextSpec};
 /// - `id_of(token)`: the id in the tokenizer of the result, null when it has no such token;
 /// - `row_norm(role)`: the norm of rows of a donor's embedding as they enter the first layer, for which all of its values are read:
 ///   the root of the mean of their squares; null where they are zeros, or cannot be read or computed;
+/// - `word_fit(from, to)`: the map between the embeddings of two donors, fitted on words that both vocabularies have, for which
+///   their rows are read: the number of `words`, and of those `left_out`; the `cosine` of predicted rows with the words' own, the
+///   same with `shuffled` words, and the `size` of predicted rows in proportion to theirs. With `words` 0, `why` there is none;
 /// - `tried(host, part)`: the versions of transformers that ran a host of this model type with a part of this model type in the
 ///   tests of the program;
 /// - `row_scale(role)`: the factor of a donor's class on embeddings of tokens, before the first layer;
 /// - `image_fold(host, guest)`: the `factor` on the projector that keeps image features as large as in the host, under the
-///   version that wrote it, when its class has the guest's language model; `with` and `without` list the versions of
+///   version that wrote it, when its class has the guest's language model; `trained` is what its own class multiplies them by; `with` and `without` list the versions of
 ///   transformers, of `--for` or all, that need the factor, or none.
 /// - `head_factor(role)`: the `factor` on logits that the class of a language model alone has, and the `key` of its config that
 ///   states it; 1 and an empty key where none is known;
@@ -353,8 +356,8 @@ pub struct TensorSpec {
     /// First row and number of rows of the donor that are used: a list of two integers. All rows when missing or null.
     #[serde(default)]
     pub slice: Option<Expression>,
-    /// Treatment of a shape that does not match: an expression that gives `copy`, `pad`, `grow-rows`, `sample-rows` or
-    /// `reinit`.
+    /// Treatment of a shape that does not match: an expression that gives `copy`, `pad`, `map`, `grow-rows`, `sample-rows`
+    /// or `reinit`.
     #[serde(default)]
     pub fit: Option<Expression>,
     /// Factor on all values, except those of `reinit`: a number. None when missing, null or 1. With `part` and without
@@ -375,12 +378,33 @@ pub struct TensorSpec {
     /// Donor tensor whose rows the new ones of `mean-like` and `sampled-like` are like.
     #[serde(default)]
     pub like: Option<SeamTensor>,
+    /// The embeddings between which `map` leads.
+    #[serde(default)]
+    pub words: Option<WordsSpec>,
     /// Donor tensor that it must match, for the message.
     #[serde(default)]
     pub meets: Option<SeamTensor>,
     /// Options that avoid the mismatch.
     #[serde(default)]
     pub options: Vec<String>,
+}
+
+/// The map of `map`, fitted on words that the vocabularies of two donors share.
+#[derive(Debug, Clone, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct WordsSpec {
+    /// Role of the donor in whose embedding's space the values are.
+    pub from: String,
+    /// Role of the donor to whose embedding's space they are mapped.
+    pub to: String,
+    /// Whether each row of a matrix is a point there, as in an embedding; otherwise each column is a direction, as in the weight
+    /// of a projector. A vector is a point.
+    #[serde(default)]
+    pub rows: bool,
+    /// Factor on the values before they are mapped: a number. None when missing.
+    #[serde(default)]
+    pub times: Option<Expression>,
 }
 
 /// An adapter that is merged.

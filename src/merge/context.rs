@@ -10,6 +10,7 @@ use serde_json::{Map, Value, json};
 use super::error::MergeError;
 use super::options::{self, Options};
 use super::parts::{Donor, DonorParts, PartOf, image_processor, value_of};
+use super::word_fit::WordFits;
 use super::{explain, functions};
 use crate::check::tokens::{OpenedTokenizer, Unopened, open_tokenizer};
 use crate::checkpoint::Checkpoint;
@@ -29,6 +30,8 @@ pub(super) struct Context<'a> {
     pub(super) library: &'a Library,
     /// Loaders that the result is for; any when empty.
     pub(super) asked: BTreeSet<Loader>,
+    /// Maps between the embeddings of donors, fitted when one is asked for.
+    pub(super) fits: Arc<WordFits>,
 }
 
 impl<'a> Context<'a> {
@@ -103,6 +106,8 @@ impl<'a> Context<'a> {
             Arc::new(donors.iter().map(|d| (d.role.clone(), Arc::clone(&d.checkpoint))).collect());
         let asked: BTreeSet<Loader> = versions.iter().map(|version| Loader::nearest(version)).collect();
         functions::register(&mut scope, donors, &asked, &knowledge.scales);
+        let fits = Arc::new(WordFits::new(donors));
+        fits.register(&mut scope);
         let all = Arc::clone(&checkpoints);
         scope.function2("shape", move |role, name| {
             all.get(role).and_then(|c| c.tensor(name)).map_or(Value::Null, |(_, t)| json!(t.shape))
@@ -115,7 +120,7 @@ impl<'a> Context<'a> {
             parts.get(role).and_then(|of| of.get(name)).cloned().unwrap_or(Value::Null)
         });
         let (processors, library) = (&*knowledge.processors, &knowledge.library);
-        let mut context = Self { recipe, donors, scope, tokens: None, processors, library, asked };
+        let mut context = Self { recipe, donors, scope, tokens: None, processors, library, asked, fits };
         for item in &recipe.lets {
             if context.tokens.is_none() && needs_tokens(&item.is) {
                 context.add_tokens()?;

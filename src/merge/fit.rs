@@ -15,6 +15,8 @@ pub(super) enum Fit {
     SampledLike,
     /// Zeros up to the shape.
     Pad,
+    /// The values in the space of another language model's embedding, which `words` names.
+    Map,
     /// New values for each module of which a tensor has another shape.
     Reinit,
     /// New values, also where the shape is equal.
@@ -23,9 +25,10 @@ pub(super) enum Fit {
 
 impl Fit {
     /// All values.
-    pub(super) const ALL: [Self; 8] = [
+    pub(super) const ALL: [Self; 9] = [
         Self::Copy,
         Self::Pad,
+        Self::Map,
         Self::GrowRows,
         Self::SampleRows,
         Self::MeanLike,
@@ -43,6 +46,7 @@ impl Fit {
             Self::MeanLike => "mean-like",
             Self::SampledLike => "sampled-like",
             Self::Pad => "pad",
+            Self::Map => "map",
             Self::Reinit => "reinit",
             Self::ReinitAlways => "reinit-always",
         }

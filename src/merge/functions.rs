@@ -76,7 +76,7 @@ pub(super) fn register(scope: &mut Scope<'static>, donors: &[Donor], asked: &BTr
 }
 
 /// The embedding of a donor's language model.
-fn embedding(donor: &Donor) -> Option<TensorRef> {
+pub(super) fn embedding(donor: &Donor) -> Option<TensorRef> {
     let name = PartOf::find(donor, "language")?.name_of("model.embed_tokens.weight")?;
     let (shard, tensor) = donor.checkpoint.tensor(&name)?;
     TensorRef::new(&donor.role, donor.checkpoint.source.path(), shard, tensor, None).ok()
@@ -106,7 +106,7 @@ fn image_fold(scales: &Scales, host: &Value, guest: &Value, loaders: &[Loader]) 
     let (with, without): (Vec<Loader>, Vec<Loader>) = loaders.iter().copied().filter(loads).partition(needs);
     let versions = |loaders: &[Loader]| loaders.iter().map(|loader| loader.version()).collect::<Vec<_>>();
     let common = with.first().map_or(1.0, |loader| factor(*loader));
-    json!({ "factor": common, "with": versions(&with), "without": versions(&without) })
+    json!({ "factor": common, "trained": trained, "with": versions(&with), "without": versions(&without) })
 }
 
 /// A chat template in front of which messages with parts become messages of text, with `turn` in place of each image. Templates
@@ -138,7 +138,14 @@ mod tests {
                 "text_config": { "model_type": text, "hidden_size": 64 } })
         };
         let guest = |text: &str| json!({ "model_type": text, "hidden_size": 64 });
-        let fold = |host: &Value, guest: &Value| image_fold(&scales, host, guest, &Loader::ALL);
+        let fold = |host: &Value, guest: &Value| {
+            let mut fold = image_fold(&scales, host, guest, &Loader::ALL);
+            assert_eq!(
+                fold.as_object_mut().unwrap().remove("trained"),
+                Some(json!(scales.of_images(host, host, Loader::V4_47_0)))
+            );
+            fold
+        };
         let of = |factor: f64, with: &[&str], without: &[&str]| json!({ "factor": factor, "with": with, "without": without });
         let all = ["4.47.0", "4.57.6", "5.23.0"];
         for (host, guest, expected) in [

@@ -9,6 +9,7 @@ use super::error::MergeError;
 use super::fit::Fit;
 use super::named::{AnnouncedCast, MergedRoles, NamedTensors};
 use super::parts::{Donor, DonorParts, PartOf};
+use super::word_fit::Found;
 use crate::checkpoint::{Dtype, Shard, Tensor};
 use crate::knowledge::recipe::TensorSpec;
 use crate::surgery::tensor_ref::TensorRef;
@@ -26,6 +27,8 @@ pub(super) struct TensorRule<'a> {
     pub(super) adapter: Option<MergedAdapter>,
     /// The tensor whose rows new ones are like.
     pub(super) like: Option<TensorRef>,
+    /// The map into the space of another embedding.
+    pub(super) mapping: Option<Mapping>,
     /// The part that the tensors belong to.
     pub(super) part: Option<PartOf<'a>>,
     /// The parts of the model that has them in the place of its own, and the name of the part there.
@@ -114,6 +117,17 @@ impl TensorRule<'_> {
     }
 }
 
+/// How the values of an entry are mapped into the space of another embedding.
+#[derive(Debug, Clone)]
+pub(super) struct Mapping {
+    /// The map, or why there is none.
+    pub(super) fit: Found,
+    /// Whether the rows of a matrix are points, and not its columns directions.
+    pub(super) rows: bool,
+    /// The factor before the map.
+    pub(super) times: f64,
+}
+
 /// A donor tensor that the recipe selects, with its name in the result.
 pub(super) struct TakenTensor<'a> {
     pub(super) name: String,
@@ -159,7 +173,9 @@ impl StartedModules {
         match taken.rule.fit {
             Fit::ReinitAlways => true,
             Fit::Reinit => self.modules.contains(&key(taken)),
-            Fit::Copy | Fit::GrowRows | Fit::SampleRows | Fit::MeanLike | Fit::SampledLike | Fit::Pad => false,
+            Fit::Copy | Fit::GrowRows | Fit::SampleRows | Fit::MeanLike | Fit::SampledLike | Fit::Pad | Fit::Map => {
+                false
+            }
         }
     }
 }

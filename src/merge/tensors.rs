@@ -15,13 +15,13 @@ use super::fit::Fit;
 use super::named::{AnnouncedCast, Bounds, Changeable, pattern};
 use super::parts::{Donor, DonorParts, PartOf};
 use super::run::count;
-use super::taken::{StartedModules, TakenTensor, TensorRule};
+use super::taken::{Mapping, StartedModules, TakenTensor, TensorRule};
 use crate::checkpoint::{Dtype, Tensor};
 use crate::knowledge::quantization;
 use crate::knowledge::recipe::{SeamTensor, TensorSpec};
 use crate::knowledge::{Evidence, Expression, Initial, Knowledge, Library, Loader};
 use crate::report::model::{Cast, ChangedTensor, Dropped, Seam, ShapedName};
-use crate::surgery::expr::{NewValues, TensorExpr, TensorTransform};
+use crate::surgery::expr::{Mapped, NewValues, TensorExpr, TensorTransform};
 use crate::surgery::plan::into_shards;
 use crate::surgery::planned_tensor::PlannedTensor;
 use crate::surgery::tensor_ref::TensorRef;
@@ -215,6 +215,7 @@ fn record(taken: &TakenTensor<'_>, planned: &PlannedTensor, draft: &mut MergeDra
         | TensorTransform::SampleRows
         | TensorTransform::NewRows
         | TensorTransform::Pad
+        | TensorTransform::Map
         | TensorTransform::Reinit => true,
     };
     if has_new_values || taken.rule.spec.train {
@@ -291,6 +292,7 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
             rename,
             adapter: adapter(context, spec)?,
             like: spec.like.as_ref().and_then(|like| like_of(context, like)),
+            mapping: mapping(context, spec)?,
             part,
             into,
             slice: parse_slice(&slice).map_err(|expected| wrong("slice", &slice, expected))?,
@@ -316,6 +318,14 @@ fn like_of(context: &Context<'_>, like: &SeamTensor) -> Option<TensorRef> {
     let donor = context.donor(&like.from)?;
     let (shard, tensor) = donor.checkpoint.tensor(&like.name)?;
     TensorRef::new(&donor.role, donor.checkpoint.source.path(), shard, tensor, None).ok()
+}
+
+/// The map that an entry names.
+fn mapping(context: &Context<'_>, spec: &TensorSpec) -> Result<Option<Mapping>, MergeError> {
+    let Some(words) = &spec.words else { return Ok(None) };
+    let times = words.times.as_ref().map_or(Ok(Value::from(1.0)), |times| times.eval(&context.scope));
+    let times = times.map_err(context.at(format!("times of {}", spec.names)))?.as_f64().unwrap_or(f64::NAN);
+    Ok(Some(Mapping { fit: context.fits.between(&words.from, &words.to), rows: words.rows, times }))
 }
 
 /// The adapter that an entry merges, with its tensors placed.
@@ -348,7 +358,7 @@ fn parse_slice(value: &Value) -> Result<Option<[u64; 2]>, &'static str> {
 
 fn parse_fit(value: &Value) -> Result<Fit, &'static str> {
     let known = |name: &str| Fit::ALL.into_iter().find(|fit| fit.name() == name);
-    let expected = "copy, pad, grow-rows, sample-rows, mean-like, sampled-like, reinit or reinit-always";
+    let expected = "copy, pad, map, grow-rows, sample-rows, mean-like, sampled-like, reinit or reinit-always";
     match value {
         Value::Null => Ok(Fit::Copy),
         value => value.as_str().and_then(known).ok_or(expected),
@@ -415,7 +425,7 @@ fn source(
     let starts = values.is_some();
     let scale = rule.scale_of(tensor);
     let changes = scale.is_some() || taken.dtype() != tensor.dtype;
-    let is_replaced = matches!(rule.fit, Fit::MeanLike | Fit::SampledLike);
+    let is_replaced = matches!(rule.fit, Fit::MeanLike | Fit::SampledLike | Fit::Map);
     let fits = of.shape == shape && !starts && !is_replaced;
     if (changes || !(fits || rule.fit == Fit::Copy)) && !can_compute(tensor.dtype) {
         return Err(format!("values of type {} can only be copied", tensor.dtype));
@@ -430,6 +440,8 @@ fn source(
         Fit::Pad if !nests => return Err(CANNOT_SHRINK.to_owned()),
         Fit::GrowRows | Fit::SampleRows if !grows => return Err("only rows can be added".to_owned()),
         Fit::Pad => TensorExpr::Pad { of, shape },
+        // Rounded once, after its factor.
+        Fit::Map => return mapped(of, rule.mapping.as_ref(), scale.unwrap_or(1.0), dtype),
         Fit::MeanLike | Fit::SampledLike => {
             let like = rule.like.clone().ok_or("the tensor that its rows should be like is missing")?;
             if like.shape.len() != shape.len() || !like.shape.iter().skip(1).eq(shape.iter().skip(1)) {
@@ -448,6 +460,18 @@ fn source(
         }
     };
     Ok(fitted.converted(tensor.dtype, scale, dtype))
+}
+
+/// A tensor in the space of another embedding.
+fn mapped(of: TensorRef, mapping: Option<&Mapping>, after: f64, to: Dtype) -> Result<TensorExpr<TensorRef>, String> {
+    let Mapping { fit, rows, times } = mapping.ok_or("no `words` name the embeddings between which it is mapped")?;
+    let map = (**fit).as_ref().map_err(Clone::clone)?.map.clone();
+    let values = match of.shape.len() {
+        1 => Mapped::Point,
+        _ if *rows => Mapped::Rows,
+        _ => Mapped::Columns,
+    };
+    Ok(TensorExpr::Map { of, values, before: *times, after, to, map: Box::new(map) })
 }
 
 /// Why `reinit` does not help.

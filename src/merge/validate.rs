@@ -243,6 +243,10 @@ impl Validator<'_> {
             }
             self.seam_tensor(tensor.meets.as_ref())?;
             self.seam_tensor(tensor.like.as_ref())?;
+            if let Some(words) = &tensor.words {
+                self.role("from", &words.from)?;
+                self.role("to", &words.to)?;
+            }
             self.named(tensor)?;
             if let Err(why) = pattern(&tensor.names) {
                 let reason = format!("`{}` {why}", escape(&tensor.names, 80));

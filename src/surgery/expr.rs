@@ -15,6 +15,9 @@ use crate::checkpoint::{Dtype, byte_len};
 /// rank 256 of a matrix with 500 000 rows.
 const MAX_FACTORS: u64 = 1 << 27;
 
+/// Maximum number of values in the matrices of a map. They are binary64 numbers, so 512 MiB: from 4096 to 8192 dimensions.
+const MAX_MAP: u64 = 1 << 26;
+
 /// An expression for the values of a tensor; `S` names a donor's tensor, or some of its rows.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
@@ -55,6 +58,22 @@ pub enum TensorExpr<S> {
         /// Shape of the result.
         shape: Vec<u64>,
     },
+    /// The donor's values in the space of another language model's embedding.
+    Map {
+        /// The donor's values.
+        of: S,
+        /// Which of them are a point or a direction in the space of the first embedding.
+        values: Mapped,
+        /// A constant by which they are multiplied before.
+        before: f64,
+        /// A constant by which they are multiplied after it.
+        after: f64,
+        /// The type to which they are rounded then.
+        #[cfg_attr(test, schemars(with = "String"))]
+        to: Dtype,
+        /// The map.
+        map: Box<WordMap<S>>,
+    },
     /// The values that the class gives to a new model; random ones are seeded with the name of the tensor.
     #[serde(rename_all = "kebab-case")]
     Initialise {
@@ -93,6 +112,34 @@ pub enum TensorExpr<S> {
         /// The product.
         product: Product<S>,
     },
+}
+
+/// How a tensor lies in the space of an embedding.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(rename_all = "kebab-case")]
+pub enum Mapped {
+    /// Each column is a direction: the weight of a projector.
+    Columns,
+    /// It is a point: the bias of a projector.
+    Point,
+    /// Each row is a point: more rows of the embedding.
+    Rows,
+}
+
+/// A linear map between the rows of two embeddings, fitted on words that both vocabularies have ([`super::word_map`]).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(test, derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct WordMap<S> {
+    /// The embedding from which it leads.
+    pub from: S,
+    /// The embedding to which it leads.
+    pub to: S,
+    /// The rows of each word in the two.
+    pub words: Vec<[u64; 2]>,
+    /// Weight of the penalty on large maps, in proportion to the mean variance of the first embedding.
+    pub ridge: f64,
 }
 
 /// The values of a tensor that starts again, as its class gives them to a new model.
@@ -186,6 +233,8 @@ pub enum TensorTransform {
     NewRows,
     /// The donor's values in the leading corner, zeros elsewhere.
     Pad,
+    /// The donor's values in the space of another language model's embedding.
+    Map,
     /// The values that the class gives to a new model.
     Reinit,
     /// The donor's values plus a product of two matrices of another donor.
@@ -203,6 +252,7 @@ impl TensorTransform {
             Self::SampleRows => "sample-rows",
             Self::NewRows => "new-rows",
             Self::Pad => "pad",
+            Self::Map => "map",
             Self::Reinit => "reinit",
             Self::AddProduct => "add-product",
         }
@@ -245,6 +295,7 @@ impl<S> TensorExpr<S> {
             | Self::Pad { of, .. }
             | Self::Initialise { instead_of: of, .. } => vec![of],
             Self::NewRows { like, instead_of, .. } => vec![instead_of, like],
+            Self::Map { of, map, .. } => vec![of, &map.from, &map.to],
             Self::Cast { of, .. } | Self::Scale { of, .. } => of.sources(),
             Self::AddProduct { to, product } => {
                 let mut sources = to.sources();
@@ -261,6 +312,7 @@ impl<S> TensorExpr<S> {
             | Self::GrowRows { of, .. }
             | Self::SampleRows { of, .. }
             | Self::Pad { of, .. }
+            | Self::Map { of, .. }
             | Self::Initialise { instead_of: of, .. }
             | Self::NewRows { instead_of: of, .. } => of,
             Self::Cast { of, .. } | Self::Scale { of, .. } | Self::AddProduct { to: of, .. } => of.main(),
@@ -284,6 +336,7 @@ impl<S> TensorExpr<S> {
             Self::SampleRows { .. } => TensorTransform::SampleRows,
             Self::NewRows { .. } => TensorTransform::NewRows,
             Self::Pad { .. } => TensorTransform::Pad,
+            Self::Map { .. } => TensorTransform::Map,
             Self::Initialise { .. } => TensorTransform::Reinit,
             Self::AddProduct { .. } => TensorTransform::AddProduct,
             Self::Cast { of, .. } | Self::Scale { of, .. } => match of.transform() {
@@ -297,7 +350,7 @@ impl<S> TensorExpr<S> {
     #[must_use]
     pub fn scale(&self) -> Option<f64> {
         match self {
-            Self::Scale { by, .. } => Some(*by),
+            Self::Scale { by, .. } | Self::Map { after: by, .. } => Some(*by),
             Self::AddProduct { product, .. } => Some(product.scale),
             Self::Cast { of, .. } => of.scale(),
             _ => None,
@@ -327,6 +380,12 @@ impl<S> TensorExpr<S> {
                 TensorExpr::NewRows { like: to(like)?, rows: *rows, sampled: *sampled, instead_of }
             }
             Self::Pad { of, shape } => TensorExpr::Pad { of: to(of)?, shape: shape.clone() },
+            Self::Map { of, values, before, after, to: dtype, map } => {
+                let of = to(of)?;
+                let map =
+                    WordMap { from: to(&map.from)?, to: to(&map.to)?, words: map.words.clone(), ridge: map.ridge };
+                TensorExpr::Map { of, values: *values, before: *before, after: *after, to: *dtype, map: Box::new(map) }
+            }
             Self::Initialise { values, dtype, shape, instead_of } => TensorExpr::Initialise {
                 values: *values,
                 dtype: *dtype,
@@ -399,6 +458,21 @@ impl TensorExpr<TensorRef> {
                     of.shape.len() == shape.len() && of.shape.iter().zip(shape).all(|(have, want)| have <= want);
                 if nests { Ok((of.dtype, shape.clone())) } else { Err(format!("{:?} cannot be padded", of.shape)) }
             }
+            Self::Map { of, values, before, after, to: dtype, map } => {
+                computable(of.dtype).and_then(|()| computable(*dtype))?;
+                let [from, to] = map.widths()?;
+                let shape = match (values, of.shape.as_slice()) {
+                    (Mapped::Columns, &[width, columns]) if width == from => vec![to, columns],
+                    (Mapped::Point, &[width]) if width == from => vec![to],
+                    (Mapped::Rows, &[rows, width]) if width == from => vec![rows, to],
+                    _ => return Err(format!("{:?} is not in a space of {from} dimensions", of.shape)),
+                };
+                let is_factor = |by: &&f64| by.is_finite() && **by != 0.0;
+                match [before, after].into_iter().find(|by| !is_factor(by)) {
+                    None => Ok((*dtype, shape)),
+                    Some(by) => Err(format!("{by} is no factor")),
+                }
+            }
             Self::Initialise { values, dtype, shape, .. } => {
                 computable(*dtype)?;
                 if values.is_possible() { Ok((*dtype, shape.clone())) } else { Err("no distribution".to_owned()) }
@@ -423,6 +497,30 @@ impl TensorExpr<TensorRef> {
                 Ok((dtype, shape))
             }
         }
+    }
+}
+
+impl WordMap<TensorRef> {
+    /// The widths of the two embeddings.
+    ///
+    /// # Errors
+    /// Why no map can be fitted.
+    pub(super) fn widths(&self) -> Result<[u64; 2], String> {
+        let (&[from_rows, from], &[to_rows, to]) = (self.from.shape.as_slice(), self.to.shape.as_slice()) else {
+            return Err("an embedding is no matrix".to_owned());
+        };
+        computable(self.from.dtype).and_then(|()| computable(self.to.dtype))?;
+        let is_there = |word: &[u64; 2]| matches!(*word, [x, y] if x < from_rows && y < to_rows);
+        if self.words.len() < 2 || !self.words.iter().all(is_there) {
+            return Err("the embeddings do not have the rows of the words".to_owned());
+        }
+        // Σ x xᵀ twice, and Σ y xᵀ.
+        let values = from.saturating_mul(from).saturating_mul(2).saturating_add(to.saturating_mul(from));
+        if values > MAX_MAP || from == 0 {
+            return Err(format!("a map from {from} to {to} dimensions is too large"));
+        }
+        let is_possible = self.ridge.is_finite() && self.ridge > 0.0;
+        if is_possible { Ok([from, to]) } else { Err(format!("{} is no penalty", self.ridge)) }
     }
 }
 

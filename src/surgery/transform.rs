@@ -15,6 +15,7 @@ use super::planned_tensor::PlannedTensor;
 use super::product::Adder;
 use super::tensor_ref::{ReadAt, TensorRef};
 use super::values::Codec;
+use super::word_map::{self, Placed};
 use crate::checkpoint::Dtype;
 use crate::checkpoint::reserve::reserved;
 
@@ -78,6 +79,11 @@ fn evaluate(
         }
         TensorExpr::Pad { of: from, shape } => {
             pad(&mut |at, buffer| of(from, at, buffer), from.dtype.bits() / 8, &from.shape, shape, out)
+        }
+        TensorExpr::Map { of: from, values, before, after, to, map } => {
+            let how = Placed { values: *values, before: *before, after: *after, to: *to };
+            facts.losses.add(word_map::write(read, from, how, map, out)?);
+            Ok(())
         }
         TensorExpr::Initialise { values, dtype, shape, .. } => new_values(&tensor.name, *dtype, shape, *values, out),
         TensorExpr::Cast { of, to } => convert(read, tensor, of, (None, *to), facts, out),

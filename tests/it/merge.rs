@@ -11,6 +11,7 @@ mod scale;
 mod users;
 mod values;
 mod verify;
+mod word_fit;
 mod writing;
 
 use std::collections::BTreeMap;

@@ -302,6 +302,7 @@ def tried(cells, outcomes):
         versions = outcomes[cell.name]
         if type(cell) in (Language, Tower) and isinstance(versions, list) and cell.host != OPENVLA:
             host, part = (model_type(path) for path in (cell.host_dir, cell.part_dir))
+            versions = sorted(version.rstrip("*") for version in versions)
             before = pairs.setdefault(host, {}).setdefault(part, versions)
             pairs[host][part] = [version for version in before if version in versions]
     return {host: dict(sorted(parts.items())) for host, parts in sorted(pairs.items())}

@@ -14,8 +14,18 @@ use crate::merge::fit::Fit;
 const TYPES: [&str; 10] = ["bool", "bytes", "double", "int", "list", "map", "null_type", "string", "type", "uint"];
 
 /// Functions of a merge's scope, with a role as the first argument.
-const ROLE_FUNCTIONS: [&str; 9] =
-    ["shape", "has", "dtype", "part", "row_norm", "row_scale", "image_fold", "head_factor", "chat_template"];
+const ROLE_FUNCTIONS: [&str; 10] = [
+    "shape",
+    "has",
+    "dtype",
+    "part",
+    "row_norm",
+    "row_scale",
+    "word_fit",
+    "image_fold",
+    "head_factor",
+    "chat_template",
+];
 
 /// The function that gives the id of a token.
 const ID_OF: &str = "id_of";
@@ -108,6 +118,7 @@ impl Validator<'_> {
             some("fit", tensor.fit.as_ref())?;
             some("dtype", tensor.dtype.as_ref())?;
             some("scale", tensor.scale.as_ref())?;
+            some("times", tensor.words.as_ref().and_then(|words| words.times.as_ref()))?;
             some("slice", tensor.slice.as_ref())?;
             some("turned", tensor.adapter.as_ref().and_then(|adapter| adapter.turned.as_ref()))?;
             tensor.rename.as_ref().map_or(Ok(()), |rename| template("as", rename))?;

@@ -158,7 +158,7 @@ fn bad_requests_exit_with_2_and_a_message() {
     let (vision, language) = (donor("spatialvla-tiny"), donor("llava3d-tiny"));
     let cases: [(&[&str], &str); 6] = [
         (&["--set", "colour=red"], "has no option colour"),
-        (&["--set", "projector=fold"], "projector=fold is not one of pad, reinit, reinit-always, keep"),
+        (&["--set", "projector=fold"], "projector=fold is not one of pad, fit, reinit, reinit-always, keep"),
         (&["--set", "shard-size=big"], "is not a size"),
         (&["--set", "alias=forward:os;rm"], "is not one of"),
         (&["--recipe", "nonesuch"], "nonesuch: unknown recipe"),

@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use super::law::bytes::{Tensors, read, values, write};
-use crate::support::base::tensors;
+use crate::support::base::{copy, tensors};
 use crate::support::knowledge;
 
 /// Hosts with the tensors of the last layer of their projectors.
@@ -303,12 +303,20 @@ fn a_result_names_the_class_of_a_host_that_does_not() {
 fn a_pair_that_no_test_runs_was_not_tried() {
     let all = TempDir::new().unwrap();
     write(all.path());
-    // The hosts of 4.47 cannot run it there, and so are not tried with it.
     as_granite(&all.path().join("llama"), false);
-    let is_noted = |host: &str| {
-        let notes = planned(all.path(), host, "llama", "5.23.0").notes;
-        assert!(!notes.is_empty(), "{host} was not planned");
+    // A model that no test puts into a host.
+    let ernie = all.path().join("ernie");
+    copy(&all.path().join("llama"), &ernie);
+    let mut config: Value = serde_json::from_slice(&fs::read(ernie.join("config.json")).unwrap()).unwrap();
+    config["model_type"] = json!("ernie4_5");
+    config["architectures"] = json!(["Ernie4_5ForCausalLM"]);
+    config["transformers_version"] = json!("5.23.0");
+    fs::write(ernie.join("config.json"), config.to_string()).unwrap();
+    tensors(&ernie, 1, &knowledge());
+    let is_noted = |guest: &str| {
+        let notes = planned(all.path(), "internvl", guest, "5.23.0").notes;
+        assert!(!notes.is_empty(), "{guest} was not planned");
         notes.iter().any(|note| note.starts_with("Not tried"))
     };
-    assert_eq!(["internvl", "llava"].map(is_noted), [false, true]);
+    assert_eq!(["llama", "ernie"].map(is_noted), [false, true]);
 }

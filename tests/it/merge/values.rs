@@ -306,7 +306,7 @@ fn slices_scales_and_types_that_do_not_fit_are_refused_in_words() {
         (json!({ "dtype": "'float8'" }), "unknown dtype `float8` in `dtype`"),
         (
             json!({ "fit": "'conv' + 'ert'" }),
-            "not copy, pad, grow-rows, sample-rows, mean-like, sampled-like, reinit or reinit-always",
+            "not copy, pad, map, grow-rows, sample-rows, mean-like, sampled-like, reinit or reinit-always",
         ),
     ] {
         let refused = narrowed(work.path(), &entry, 64);

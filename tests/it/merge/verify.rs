@@ -367,6 +367,10 @@ fn a_hostile_manifest_is_bounded() {
         let product = json!({ "left": { left: source }, "right": { right: source }, "scale": scale });
         json!({ "add-product": { "to": of(source), "product": product } })
     };
+    let mapped = |words: Value, ridge: f64, values: &str| {
+        let map = json!({ "from": source, "to": source, "words": words, "ridge": ridge });
+        json!({ "map": { "of": source, "values": values, "before": 1.0, "after": 1.0, "to": "BF16", "map": map } })
+    };
     let nested = json!({ "add-product": {
         "to": product("stored", "transposed", json!(1)),
         "product": product("stored", "transposed", json!(1))["add-product"]["product"],
@@ -383,6 +387,10 @@ fn a_hostile_manifest_is_bounded() {
             json!({ "initialise": {
             "values": { "normal": -1.0 }, "dtype": "BF16", "shape": huge, "instead-of": source } }),
         ),
+        ("map", mapped(json!([[0, 0], [1, 1]]), 1.0, "columns")),
+        ("map without words", mapped(json!([]), 1.0, "rows")),
+        ("map of rows that are not there", mapped(json!([[0, 0], [u64::MAX, 1]]), 1.0, "rows")),
+        ("map without a penalty", mapped(json!([[0, 0], [1, 1]]), -1.0, "rows")),
         ("product", product("stored", "stored", json!(1))),
         ("no factor", product("stored", "transposed", json!("many"))),
         ("two products", nested),

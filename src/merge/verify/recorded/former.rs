@@ -96,6 +96,7 @@ impl OnlySource {
             TensorTransform::Copy
             | TensorTransform::Convert
             | TensorTransform::NewRows
+            | TensorTransform::Map
             | TensorTransform::AddProduct => TensorExpr::Stored(of),
         };
         match from {
