@@ -16,9 +16,12 @@ use crate::surgery::word_map::{self, Prediction};
 /// Fewest words on which a map is fitted.
 const FEWEST: usize = 100;
 /// Most words: those with the lowest ids in the second vocabulary, which are the most frequent ones.
-const MOST_WORDS: usize = 1 << 14;
+const MOST_WORDS: usize = 1 << 13;
 /// Of this many words one is left out, to be predicted.
 const SHARE: usize = 8;
+
+/// Most words that are predicted.
+const MOST_LEFT_OUT: usize = 512;
 
 /// A map between the embeddings of two donors.
 #[derive(Debug)]
@@ -81,7 +84,8 @@ impl WordFits {
             let one = both.iter().enumerate().filter(move |(i, _)| (i % SHARE == 0) == is_left);
             one.map(|(_, word)| *word).collect::<Vec<_>>()
         };
-        let left_out = split(true);
+        let mut left_out = split(true);
+        left_out.truncate(MOST_LEFT_OUT);
         let map = WordMap { from, to, words: split(false), ridge: 1.0 };
         let (map, prediction) = word_map::choose(map, &left_out).map_err(|error| error.to_string())?;
         Ok(WordFit { map, prediction, left_out: left_out.len() })

@@ -145,9 +145,7 @@ impl FittedMap {
         solve(&self.factor, &mut vectors, self.from.len(), count);
         let mut out = vec![0.0; self.to.len().saturating_mul(count)];
         for (out, row) in out.chunks_exact_mut(count.max(1)).zip(self.cross.chunks_exact(self.from.len().max(1))) {
-            for (factor, values) in row.iter().zip(vectors.chunks_exact(count.max(1))) {
-                axpy(out, *factor, values);
-            }
+            add_rows(out, row, &vectors, count);
         }
         out
     }
@@ -270,18 +268,47 @@ fn add_products(out: &mut [f64], left: &[f64], right: &[f64], width: usize, is_s
     for (i, sums) in out.chunks_exact_mut(width.max(1)).enumerate() {
         let end = if is_symmetric { i.saturating_add(1) } else { width };
         let sums = sums.get_mut(..end).unwrap_or_default();
-        for (factor, row) in left.iter().skip(i).step_by(left_width.max(1)).zip(right.chunks_exact(width.max(1))) {
-            axpy(sums, *factor, row);
+        let factors: Vec<f64> = left.iter().skip(i).step_by(left_width.max(1)).copied().collect();
+        add_rows(sums, &factors, right, width);
+    }
+}
+
+/// Adds the rows of a matrix of this width, each times its factor, one after the other. Rust does not fuse a multiplication with an
+/// addition, so that every processor has the same sums.
+#[multiversion::multiversion(targets("x86_64+avx2"))]
+fn add_rows(sums: &mut [f64], factors: &[f64], rows: &[f64], width: usize) {
+    let width = width.max(1);
+    // Four at a time, so that sums are loaded and stored less often.
+    let (four, rest) = factors.as_chunks::<4>();
+    for (factors, rows) in four.iter().zip(rows.chunks_exact(width.saturating_mul(4))) {
+        let (a, others) = rows.split_at(width);
+        let (b, others) = others.split_at(width);
+        let (c, d) = others.split_at(width);
+        let [fa, fb, fc, fd] = *factors;
+        for ((((sum, a), b), c), d) in sums.iter_mut().zip(a).zip(b).zip(c).zip(d) {
+            *sum = (((*sum + fa * a) + fb * b) + fc * c) + fd * d;
+        }
+    }
+    let done = four.len().saturating_mul(4).saturating_mul(width);
+    for (factor, row) in rest.iter().zip(rows.get(done..).unwrap_or_default().chunks_exact(width)) {
+        for (sum, value) in sums.iter_mut().zip(row) {
+            *sum += factor * value;
         }
     }
 }
 
-/// Adds a multiple of values to others. Rust does not fuse the two operations, so that every processor has the same sums.
-#[multiversion::multiversion(targets("x86_64+avx2", "x86_64+avx512f"))]
-fn axpy(sums: &mut [f64], factor: f64, values: &[f64]) {
-    for (sum, value) in sums.iter_mut().zip(values) {
-        *sum += factor * value;
+/// The sum of products, in eight sums that are added at the end.
+#[multiversion::multiversion(targets("x86_64+avx2"))]
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    let mut sums = [0.0; 8];
+    let ((first, first_rest), (second, second_rest)) = (a.as_chunks::<8>(), b.as_chunks::<8>());
+    for (a, b) in first.iter().zip(second) {
+        for ((sum, a), b) in sums.iter_mut().zip(a).zip(b) {
+            *sum += a * b;
+        }
     }
+    let rest = first_rest.iter().zip(second_rest).map(|(a, b)| a * b).sum::<f64>();
+    sums.iter().sum::<f64>() + rest
 }
 
 /// The factor `L` of a symmetric matrix `L Lᵀ`, whose lower triangle is given, in its place.
@@ -293,12 +320,11 @@ fn cholesky(matrix: &mut [f64], width: usize) -> io::Result<()> {
         for (j, other) in done.chunks_exact(width.max(1)).enumerate() {
             let (before, from) = own.split_at_mut(j);
             let (Some(value), Some(pivot)) = (from.first_mut(), other.get(j)) else { continue };
-            let dot: f64 = before.iter().zip(other).map(|(a, b)| a * b).sum();
-            *value = (*value - dot) / pivot;
+            *value = (*value - dot(before, other.get(..j).unwrap_or_default())) / pivot;
         }
         let (before, from) = own.split_at_mut(i);
         let Some(value) = from.first_mut() else { continue };
-        let rest = *value - before.iter().map(|a| a * a).sum::<f64>();
+        let rest = *value - dot(before, before);
         if !(rest.is_finite() && rest > 0.0) {
             return Err(io::Error::new(io::ErrorKind::InvalidData, "the rows of the shared words determine no map"));
         }
@@ -314,9 +340,8 @@ fn solve(factor: &[f64], vectors: &mut [f64], width: usize, count: usize) {
     for i in 0..width {
         let (before, own) = vectors.split_at_mut(i.saturating_mul(count));
         let own = own.get_mut(..count).unwrap_or_default();
-        for (j, values) in before.chunks_exact(count).enumerate() {
-            axpy(own, -at(i, j), values);
-        }
+        let factors: Vec<f64> = (0..i).map(|j| -at(i, j)).collect();
+        add_rows(own, &factors, before, count);
         for value in own {
             *value /= at(i, i);
         }
@@ -324,9 +349,8 @@ fn solve(factor: &[f64], vectors: &mut [f64], width: usize, count: usize) {
     for i in (0..width).rev() {
         let (before, after) = vectors.split_at_mut(i.saturating_add(1).saturating_mul(count));
         let own = before.get_mut(i.saturating_mul(count)..).unwrap_or_default();
-        for (j, values) in after.chunks_exact(count).enumerate() {
-            axpy(own, -at(i.saturating_add(j).saturating_add(1), i), values);
-        }
+        let factors: Vec<f64> = (i.saturating_add(1)..width).map(|j| -at(j, i)).collect();
+        add_rows(own, &factors, after, count);
         for value in own {
             *value /= at(i, i);
         }
@@ -401,7 +425,6 @@ fn predicted(guessed: &[f64], own: &[f64], mean: &[f64]) -> Prediction {
 }
 
 fn cosine(a: &[f64], b: &[f64]) -> f64 {
-    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
     let cosine = dot(a, b) / (dot(a, a) * dot(b, b)).sqrt();
     if cosine.is_finite() { cosine } else { 0.0 }
 }
