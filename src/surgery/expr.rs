@@ -18,6 +18,9 @@ const MAX_FACTORS: u64 = 1 << 27;
 /// Maximum number of values in the matrices of a map. They are binary64 numbers, so 512 MiB: from 4096 to 8192 dimensions.
 const MAX_MAP: u64 = 1 << 26;
 
+/// Maximum number of words on which a map is fitted. Each adds its products to every value of the matrices.
+const MAX_WORDS: usize = 1 << 14;
+
 /// An expression for the values of a tensor; `S` names a donor's tensor, or some of its rows.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
@@ -513,6 +516,9 @@ impl WordMap<TensorRef> {
         let is_there = |word: &[u64; 2]| matches!(*word, [x, y] if x < from_rows && y < to_rows);
         if self.words.len() < 2 || !self.words.iter().all(is_there) {
             return Err("the embeddings do not have the rows of the words".to_owned());
+        }
+        if self.words.len() > MAX_WORDS {
+            return Err(format!("a map of {} words; at most {MAX_WORDS} are read", self.words.len()));
         }
         // Σ x xᵀ twice, and Σ y xᵀ.
         let values = from.saturating_mul(from).saturating_mul(2).saturating_add(to.saturating_mul(from));

@@ -600,6 +600,10 @@ mod tests {
         assert_eq!(refused(|map| map.ridge = 0.0), "0 is no penalty");
         assert_eq!(refused(|map| map.ridge = f64::NAN), "NaN is no penalty");
         assert_eq!(refused(|map| map.to.dtype = Dtype::I8), "values of type I8 can only be copied");
+        assert_eq!(refused(|map| map.words = vec![[0, 0]; 16385]), "a map of 16385 words; at most 16384 are read");
+        let mut many = map.clone();
+        many.words = vec![[0, 0]; 16384];
+        assert_eq!(many.widths(), Ok([FROM as u64, TO as u64]));
         // The matrices have at most 2^26 values.
         let wide = |width: u64| {
             let mut map = map.clone();
