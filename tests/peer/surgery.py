@@ -170,7 +170,7 @@ def main():
     with workplace() as temporary:
         cells = [cell for cell in all_cells(a.all, TOWERS) if re.search(a.only, cell.name) and is_drawn(cell, a.drawn, a.seed)]
         folders = sorted(a.folder, key=lambda folder: not version_in(folder).startswith(a.saved_by))
-        outcomes = run(tally, cells, folders, (a.keep or temporary).resolve())
+        outcomes = run(tally, cells, folders, (a.keep or temporary).resolve(), again=not a.saved_by)
         for cell in cells if a.list else []:
             print(f"{cell.name}: {outcomes[cell.name]}")
         if a.page:
@@ -186,8 +186,8 @@ def is_drawn(cell, share, seed):
     return random.Random(f"{seed} {type(cell).__name__} {cell.row} {cell.column}").randrange(of) < part
 
 
-def run(tally, cells, folders, work):
-    """All cells; returns {name: the versions that run it, or why it was refused}."""
+def run(tally, cells, folders, work, again):
+    """All cells, `again` with donors of each version where the oldest one's do not run; returns {name: the versions that run it, or why it was refused}."""
     donors, results = work / "donors", work / "results"
     donors.mkdir(parents=True, exist_ok=True)
     results.mkdir(exist_ok=True)
@@ -216,8 +216,8 @@ def run(tally, cells, folders, work):
             outcomes[cell.name] = f"{cell.version} does not run the host alone"
         else:
             outcomes[cell.name] = refusal(tally, cell)
-    again = [saved_again(tally, cells, outcomes, folder, work) for folder in folders]
-    for name, version in sum(again, []):
+    more = [saved_again(tally, cells, outcomes, folder, work) for folder in folders if again]
+    for name, version in sum(more, []):
         outcomes[name] = [*(outcomes[name] if isinstance(outcomes[name], list) else []), version]
     idle = [cell.name for cell in written if outcomes[cell.name] == []]
     print(f"{len(cells)} cells, {len(written)} written" + (f", and run by no version: {', '.join(idle)}" if idle else ""))
