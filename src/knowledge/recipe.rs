@@ -29,7 +29,7 @@ pub use files::{CopySpec, FileSpec, ModulesSpec, TemplateSpec, TextSpec};
 ///   the root of the mean of their squares; null where they are zeros, or cannot be read or computed;
 /// - `word_fit(from, to)`: the map between the embeddings of two donors, fitted on words that both vocabularies have, for which
 ///   their rows are read: the number of `words`, and of those `left_out`; the `cosine` of predicted rows with the words' own, the
-///   same with `shuffled` words, and the `size` of predicted rows in proportion to theirs. With `words` 0, `why` there is none;
+///   same with `shuffled` words, and the `size` of predicted rows in proportion to theirs; `words` is 0 where there is none;
 /// - `tried(host, part)`: the versions of transformers that ran a host of this model type with a part of this model type in the
 ///   tests of the program;
 /// - `row_scale(role)`: the factor of a donor's class on embeddings of tokens, before the first layer;

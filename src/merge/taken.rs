@@ -9,9 +9,9 @@ use super::error::MergeError;
 use super::fit::Fit;
 use super::named::{AnnouncedCast, MergedRoles, NamedTensors};
 use super::parts::{Donor, DonorParts, PartOf};
-use super::word_fit::Found;
 use crate::checkpoint::{Dtype, Shard, Tensor};
 use crate::knowledge::recipe::TensorSpec;
+use crate::surgery::expr::WordMap;
 use crate::surgery::tensor_ref::TensorRef;
 use crate::surgery::values::can_compute;
 
@@ -27,8 +27,8 @@ pub(super) struct TensorRule<'a> {
     pub(super) adapter: Option<MergedAdapter>,
     /// The tensor whose rows new ones are like.
     pub(super) like: Option<TensorRef>,
-    /// The map into the space of another embedding.
-    pub(super) mapping: Option<Mapping>,
+    /// The map into the space of another embedding, with the fit `map`.
+    pub(super) mapping: Option<WordMapping>,
     /// The part that the tensors belong to.
     pub(super) part: Option<PartOf<'a>>,
     /// The parts of the model that has them in the place of its own, and the name of the part there.
@@ -119,9 +119,9 @@ impl TensorRule<'_> {
 
 /// How the values of an entry are mapped into the space of another embedding.
 #[derive(Debug, Clone)]
-pub(super) struct Mapping {
+pub(super) struct WordMapping {
     /// The map, or why there is none.
-    pub(super) fit: Found,
+    pub(super) map: Result<Box<WordMap<TensorRef>>, String>,
     /// Whether the rows of a matrix are points, and not its columns directions.
     pub(super) rows: bool,
     /// The factor before the map.

@@ -15,7 +15,7 @@ use super::fit::Fit;
 use super::named::{AnnouncedCast, Bounds, Changeable, pattern};
 use super::parts::{Donor, DonorParts, PartOf};
 use super::run::count;
-use super::taken::{Mapping, StartedModules, TakenTensor, TensorRule};
+use super::taken::{StartedModules, TakenTensor, TensorRule, WordMapping};
 use crate::checkpoint::{Dtype, Tensor};
 use crate::knowledge::quantization;
 use crate::knowledge::recipe::{SeamTensor, TensorSpec};
@@ -292,7 +292,7 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
             rename,
             adapter: adapter(context, spec)?,
             like: spec.like.as_ref().and_then(|like| like_of(context, like)),
-            mapping: mapping(context, spec)?,
+            mapping: None,
             part,
             into,
             slice: parse_slice(&slice).map_err(|expected| wrong("slice", &slice, expected))?,
@@ -301,7 +301,9 @@ fn rules<'a>(context: &Context<'a>) -> Result<Vec<TensorRule<'a>>, MergeError> {
             dtype: parse_dtype(&dtype).map_err(|expected| wrong("dtype", &dtype, expected))?,
         };
         rule.scales_something(&context.recipe.recipe)?;
-        out.push(rule);
+        // To fit a map takes seconds.
+        let mapping = if rule.fit == Fit::Map { Some(mapping(context, spec)?) } else { None };
+        out.push(TensorRule { mapping, ..rule });
     }
     Ok(out)
 }
@@ -320,12 +322,18 @@ fn like_of(context: &Context<'_>, like: &SeamTensor) -> Option<TensorRef> {
     TensorRef::new(&donor.role, donor.checkpoint.source.path(), shard, tensor, None).ok()
 }
 
-/// The map that an entry names.
-fn mapping(context: &Context<'_>, spec: &TensorSpec) -> Result<Option<Mapping>, MergeError> {
-    let Some(words) = &spec.words else { return Ok(None) };
-    let times = words.times.as_ref().map_or(Ok(Value::from(1.0)), |times| times.eval(&context.scope));
-    let times = times.map_err(context.at(format!("times of {}", spec.names)))?.as_f64().unwrap_or(f64::NAN);
-    Ok(Some(Mapping { fit: context.fits.between(&words.from, &words.to), rows: words.rows, times }))
+/// The map that an entry with the fit `map` names.
+fn mapping(context: &Context<'_>, spec: &TensorSpec) -> Result<WordMapping, MergeError> {
+    let wrong = |what: &str| MergeError::Recipe(format!("{}: {what}", context.recipe.recipe));
+    let missing = || wrong(&format!("fit of {} is map, and no `words` name two embeddings", spec.names));
+    let words = spec.words.as_ref().ok_or_else(missing)?;
+    let times = words.times.as_ref().map_or(Ok(Value::Null), |times| times.eval(&context.scope));
+    let times = times.map_err(context.at(format!("times of {}", spec.names)))?;
+    let by = parse_scale(&times);
+    let by = by.map_err(|expected| wrong(&format!("times of {} is {times}, not {expected}", spec.names)))?;
+    let found = context.fits.between(&words.from, &words.to);
+    let map = (*found).as_ref().map(|fit| Box::new(fit.map.clone())).map_err(Clone::clone);
+    Ok(WordMapping { map, rows: words.rows, times: by.unwrap_or(1.0) })
 }
 
 /// The adapter that an entry merges, with its tensors placed.
@@ -441,7 +449,10 @@ fn source(
         Fit::GrowRows | Fit::SampleRows if !grows => return Err("only rows can be added".to_owned()),
         Fit::Pad => TensorExpr::Pad { of, shape },
         // Rounded once, after its factor.
-        Fit::Map => return mapped(of, rule.mapping.as_ref(), scale.unwrap_or(1.0), dtype),
+        Fit::Map => {
+            let mapping = rule.mapping.as_ref().ok_or("it has no map")?;
+            return mapped(of, mapping, scale.unwrap_or(1.0), dtype);
+        }
         Fit::MeanLike | Fit::SampledLike => {
             let like = rule.like.clone().ok_or("the tensor that its rows should be like is missing")?;
             if like.shape.len() != shape.len() || !like.shape.iter().skip(1).eq(shape.iter().skip(1)) {
@@ -463,15 +474,13 @@ fn source(
 }
 
 /// A tensor in the space of another embedding.
-fn mapped(of: TensorRef, mapping: Option<&Mapping>, after: f64, to: Dtype) -> Result<TensorExpr<TensorRef>, String> {
-    let Mapping { fit, rows, times } = mapping.ok_or("no `words` name the embeddings between which it is mapped")?;
-    let map = (**fit).as_ref().map_err(Clone::clone)?.map.clone();
+fn mapped(of: TensorRef, mapping: &WordMapping, after: f64, to: Dtype) -> Result<TensorExpr<TensorRef>, String> {
     let values = match of.shape.len() {
         1 => Mapped::Point,
-        _ if *rows => Mapped::Rows,
+        _ if mapping.rows => Mapped::Rows,
         _ => Mapped::Columns,
     };
-    Ok(TensorExpr::Map { of, values, before: *times, after, to, map: Box::new(map) })
+    Ok(TensorExpr::Map { of, values, before: mapping.times, after, to, map: mapping.map.clone()? })
 }
 
 /// Why `reinit` does not help.

@@ -11,15 +11,14 @@ use crate::checkpoint::Checkpoint;
 use crate::knowledge::Scope;
 use crate::surgery::expr::WordMap;
 use crate::surgery::tensor_ref::TensorRef;
-use crate::surgery::word_map::{self, Prediction};
+use crate::surgery::word_map::{self, WordPrediction};
 
-/// Fewest words on which a map is fitted.
+/// Fewest words that the vocabularies must share.
 const FEWEST: usize = 100;
-/// Most words: those with the lowest ids in the second vocabulary, which are the most frequent ones.
+/// Most words that are used: those with the lowest ids in the second vocabulary, which are the most frequent ones.
 const MOST_WORDS: usize = 1 << 13;
 /// Of this many words one is left out, to be predicted.
 const SHARE: usize = 8;
-
 /// Most words that are predicted.
 const MOST_LEFT_OUT: usize = 512;
 
@@ -28,18 +27,18 @@ const MOST_LEFT_OUT: usize = 512;
 pub(super) struct WordFit {
     pub(super) map: WordMap<TensorRef>,
     /// How well it predicts the words that were left out, and their number.
-    prediction: Prediction,
+    prediction: WordPrediction,
     left_out: usize,
 }
 
 /// A map, or why there is none.
-pub(super) type Found = Arc<Result<WordFit, String>>;
+type FoundFit = Arc<Result<WordFit, String>>;
 
 /// What fits are made of, by role.
 #[derive(Debug)]
 pub(super) struct WordFits {
     donors: BTreeMap<String, (Arc<Checkpoint>, Option<TensorRef>)>,
-    found: Mutex<BTreeMap<[String; 2], Found>>,
+    found: Mutex<BTreeMap<[String; 2], FoundFit>>,
 }
 
 impl WordFits {
@@ -52,15 +51,12 @@ impl WordFits {
     pub(super) fn register(self: &Arc<Self>, scope: &mut Scope<'static>) {
         let fits = Arc::clone(self);
         scope.function2("word_fit", move |from, to| {
-            fits.between(from, to)
-                .as_ref()
-                .as_ref()
-                .map_or_else(|why| json!({ "words": 0, "why": why }), WordFit::summary)
+            (*fits.between(from, to)).as_ref().map_or_else(|_| json!({ "words": 0, "size": 1.0 }), WordFit::summary)
         });
     }
 
     /// The map between the embeddings of two donors, or why there is none. It is fitted once.
-    pub(super) fn between(&self, from: &str, to: &str) -> Found {
+    pub(super) fn between(&self, from: &str, to: &str) -> FoundFit {
         let mut found = self.found.lock().unwrap_or_else(PoisonError::into_inner);
         let key = [from.to_owned(), to.to_owned()];
         Arc::clone(found.entry(key).or_insert_with(|| Arc::new(self.fit(from, to))))
@@ -95,7 +91,7 @@ impl WordFits {
 impl WordFit {
     /// What a recipe sees.
     fn summary(&self) -> Value {
-        let Prediction { cosine, shuffled, size } = self.prediction;
+        let WordPrediction { cosine, shuffled, size } = self.prediction;
         json!({ "words": self.map.words.len(), "left_out": self.left_out, "cosine": rounded(cosine), "shuffled": rounded(shuffled), "size": size })
     }
 }

@@ -15,7 +15,7 @@ use super::planned_tensor::PlannedTensor;
 use super::product::Adder;
 use super::tensor_ref::{ReadAt, TensorRef};
 use super::values::Codec;
-use super::word_map::{self, Placed};
+use super::word_map::{self, MappedAs};
 use crate::checkpoint::Dtype;
 use crate::checkpoint::reserve::reserved;
 
@@ -81,7 +81,7 @@ fn evaluate(
             pad(&mut |at, buffer| of(from, at, buffer), from.dtype.bits() / 8, &from.shape, shape, out)
         }
         TensorExpr::Map { of: from, values, before, after, to, map } => {
-            let how = Placed { values: *values, before: *before, after: *after, to: *to };
+            let how = MappedAs { values: *values, before: *before, after: *after, to: *to };
             facts.losses.add(word_map::write(read, from, how, map, out)?);
             Ok(())
         }

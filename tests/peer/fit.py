@@ -6,7 +6,8 @@
 The vocabularies of the tiny donors get words that both have, and the embedding of the language donor becomes a known map of that of
 the vision donor, with noise. The map of the manifest is fitted again by numpy in float64: the words, the penalty, the cosine that
 the report tells, and every value of the projector and of the spatial embedding are compared. A value may be one unit in the last
-place of bfloat16 apart, and one in a thousand of them is. One processor and two write the same bytes, and `verify` makes them again.
+place of bfloat16 apart, and at most one in a thousand is. One processor and two write the same bytes, and `verify` makes them again.
+A merge that asks for no fit does not read the rows of the words.
 """
 
 import argparse
@@ -120,6 +121,17 @@ def build(work, out, *more, one=False):
     return done.returncode, done.stdout, done.stderr
 
 
+def reads(work, projector):
+    """How often a dry run reads from its donors."""
+    words = ["build-merged", "--vision", work / "vision", "--language", work / "language", "--out", work / "none", "--dry-run"]
+    words = [os.environ["CKPT_DOCTOR"], *map(str, words), "--set", f"projector={projector}"]
+    trace = work / "trace"
+    done = subprocess.run(["strace", "-f", "-o", trace, "-e", "trace=pread64", *words], capture_output=True, text=True)
+    if done.returncode:
+        sys.exit(f"strace: {done.stderr[-500:]}")
+    return trace.read_text().count("pread64(")
+
+
 def case(tally, work, rng, noise, as_text):
     rows, both = donors(work, rng, noise)
     more = ["--set", "scale=text"] if as_text else []
@@ -178,6 +190,8 @@ def case(tally, work, rng, noise, as_text):
     code, out, err = build(work, work / "one", *more, one=True)
     same = code == 0 and read_tensors(work / "one") == found
     tally.expect(same, f"{name}: other bytes on one processor", err[-300:])
+    few, many = reads(work, "pad"), reads(work, "fit")
+    tally.expect(few < len(both) < many, f"{name}: {few} reads without a fit, {many} with one of {len(both)} words")
     code, out, err = doctor(
         "verify", work / "out", "--donor", f"vision={work / 'vision'}", "--donor", f"language={work / 'language'}"
     )

@@ -302,6 +302,12 @@ fn slices_scales_and_types_that_do_not_fit_are_refused_in_words() {
         (json!({ "slice": "[0, 0]" }), "it has no 0 rows from row 0 on"),
         (json!({ "slice": "7" }), "is 7, not a list of the first row and the number of rows"),
         (json!({ "scale": "0" }), "is 0, not a finite number other than 0"),
+        (json!({ "fit": "'map'" }), "is map, and no `words` name two embeddings"),
+        (
+            json!({ "fit": "'map'", "words": { "from": "from", "to": "from", "times": "0" } }),
+            "is 0, not a finite number other than 0",
+        ),
+        (json!({ "fit": "'map'", "words": { "from": "from", "to": "else" } }), "else"),
         (json!({ "dtype": "'int' + '8'" }), "is \"int8\", not bfloat16, float16, float32 or float64"),
         (json!({ "dtype": "'float8'" }), "unknown dtype `float8` in `dtype`"),
         (
