@@ -349,11 +349,13 @@ impl<S> TensorExpr<S> {
         }
     }
 
-    /// The constant factor on all values, or on the product that is added to them.
+    /// The constant factor on all values, or on the product that is added to them; `None` for a map with the factor 1.
     #[must_use]
+    #[expect(clippy::float_cmp, reason = "a factor of exactly 1 changes nothing")]
     pub fn scale(&self) -> Option<f64> {
         match self {
-            Self::Scale { by, .. } | Self::Map { after: by, .. } => Some(*by),
+            Self::Scale { by, .. } => Some(*by),
+            Self::Map { after, .. } => Some(*after).filter(|by| *by != 1.0),
             Self::AddProduct { product, .. } => Some(product.scale),
             Self::Cast { of, .. } => of.scale(),
             _ => None,

@@ -43,6 +43,10 @@ fn a_fitted_projector_is_recorded_and_made_again() {
     assert_eq!(merged.status.code(), Some(0), "{}", text(&merged));
     let merged = report(&merged);
     assert_eq!(merged["merge"]["transforms"], json!({ "copy": 349, "sample-rows": 2, "map": 3 }));
+    // The spatial embedding has rows of the embedding itself, which no factor changes.
+    let changed = merged["merge"]["changed"].as_array().unwrap().iter();
+    let scales = changed.filter(|changed| changed["transform"] == "map").map(|changed| changed["scale"].is_number());
+    assert_eq!(scales.collect::<Vec<_>>(), [true, true, false]);
     let notes = merged["merge"]["notes"].as_array().unwrap();
     let told: Vec<&str> = notes.iter().filter_map(Value::as_str).filter(|note| note.contains("cosine")).collect();
     snapshot!("merge-fitted-notes", told.join("\n"));
