@@ -196,6 +196,7 @@ class Run:
             **os.environ,
             "SEED": str(seed),
             "TIER": tier,
+            "CKPT_DOCTOR_COPY": str(CI / "program/ckpt-doctor"),
             "CKPT_DOCTOR_FORKED": str(ROOT / ".ci/forked.py"),
             "CKPT_DOCTOR_FORKED_PYTHON": f"{python.stdout.strip()}/bin/python",
             "CKPT_DOCTOR_FORKED_PLACE": self.place,
