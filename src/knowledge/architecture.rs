@@ -22,6 +22,8 @@ pub use doubt::Doubt;
 #[cfg(test)]
 pub(crate) use field_type::FieldType;
 pub use refusal::Refusal;
+#[cfg(test)]
+pub(crate) use refusal::UnknownPart;
 
 use super::{Evidence, Library, Loader};
 

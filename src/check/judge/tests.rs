@@ -6,10 +6,11 @@ use std::path::Path;
 use serde_json::{Value, json};
 
 use super::classes::{build_classes, faults as class_faults, resolve_targets};
-use super::explain::explain;
+use super::explain::{ExplainedLoad, explain};
 use super::predict::predict;
 use super::*;
-use crate::checkpoint::FaultKind;
+use crate::checkpoint::{Dtype, FaultKind};
+use crate::knowledge::architecture::UnknownPart;
 use crate::knowledge::{Loader, Refusal};
 
 /// A donor, its config with some values changed, and its tensors under other names.
@@ -139,6 +140,21 @@ fn a_backbone_of_another_model_type_is_not_covered() {
     assert!(fault.detail["part"].as_str().unwrap().contains("timm_backbone"), "{fault:?}");
 }
 
+/// A part without a config of its own is read from config.json as a whole.
+#[test]
+fn what_is_unknown_has_a_place_in_the_config() {
+    let place = |config: &str| {
+        let case = llama(&["5.23.0"]);
+        let inputs = case.inputs();
+        let mut built = build_classes(&inputs, resolve_targets(&inputs));
+        let part = UnknownPart { config: config.to_owned(), model_type: Some("none".to_owned()), class: None };
+        built[0].class = Err(Refusal::UnknownPart(part));
+        class_faults(&inputs, &built).remove(0).places.remove(0).pointer
+    };
+    assert_eq!(place("").as_deref(), Some("/model_type"));
+    assert_eq!(place("text_config.part").as_deref(), Some("/text_config/part/model_type"));
+}
+
 #[test]
 fn a_class_is_built_from_tensors_under_names_that_the_loader_renames() {
     let whole = Case::new("llava3d-tiny");
@@ -176,7 +192,9 @@ fn a_config_value_explains_the_tensors_that_follow_from_it() {
     let votes = explain::distinct_votes(&loads);
     let [vote] = votes.as_slice() else { panic!("{votes:?}") };
     assert_eq!((vote.pointer.as_str(), &vote.voted_value), ("/num_hidden_layers", &json!(2)));
-    assert_eq!(kinds(&faults::faults(&inputs, &loads, &votes)), [FaultKind::ConfigOutvoted]);
+    let faults = faults::faults(&inputs, &loads, &votes);
+    assert_eq!(kinds(&faults), [FaultKind::ConfigOutvoted]);
+    assert_eq!(faults[0].loaders, loads.iter().map(ExplainedLoad::loader).collect::<Vec<_>>());
 }
 
 #[test]
@@ -192,6 +210,27 @@ fn a_value_is_voted_on_once_for_all_loads() {
     );
     assert_eq!((distinct.len(), loads.len()), (2, 2));
     assert!(loads.iter().all(|load| pointers(load.votes().unwrap()) == distinct));
+}
+
+/// What a quantised module stores is read by the library that packed it.
+#[test]
+fn integers_are_a_fault_of_plain_weights_alone() {
+    let faults = |case: Case| {
+        let inputs = case.inputs();
+        let loads = explain(&inputs, predict(&inputs, build_classes(&inputs, resolve_targets(&inputs))));
+        integers::fault(&inputs, &loads).map(|fault| fault.loaders)
+    };
+    let stored = |dtype: Dtype| {
+        let mut case = llama(&["4.57.6"]);
+        for tensor in case.checkpoint.shards.values_mut().flat_map(|shard| &mut shard.tensors) {
+            tensor.dtype = if tensor.name == "lm_head.weight" { dtype } else { tensor.dtype };
+        }
+        case
+    };
+    assert_eq!(faults(stored(Dtype::F32)), None);
+    assert_eq!(faults(stored(Dtype::I8)), Some(vec!["4.57.6"]));
+    let packed = json!({ "quant_method": "bitsandbytes", "load_in_8bit": true });
+    assert_eq!(faults(stored(Dtype::I8).set("quantization_config", packed)), None);
 }
 
 #[test]

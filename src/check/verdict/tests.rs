@@ -191,6 +191,28 @@ fn a_model_rests_on_its_tokenizer_where_it_has_a_processor() {
     }
 }
 
+/// The model does not rest on its tokenizer here, as it has no processor.
+#[test]
+fn an_object_rests_on_its_own_files() {
+    let resting = |case: &Case| {
+        let names_it = |object: &Object| case.of(*object).1.is_some_and(|why| why.ends_with("and was not read"));
+        Object::ALL.into_iter().filter(names_it).collect::<Vec<_>>()
+    };
+    let document = |file: &str| resting(&Case::new().report(LoadReport::default()).not_read(file, NotRead::TooLarge));
+    assert_eq!(document("tokenizer_config.json"), [Tokenizer]);
+    assert_eq!(document("preprocessor_config.json"), [Object::Processor]);
+    assert_eq!(document("generation_config.json"), [Model, Object::Generation]);
+    let mut weights = Case::new().report(LoadReport::default());
+    let mut adapter = weights.checkpoint.shards.values().next().unwrap().clone();
+    weights.checkpoint.shards.values_mut().next().unwrap().not_read = Some(NotRead::TooLarge);
+    assert_eq!(resting(&weights), [Model]);
+    adapter.name = "adapter_model.safetensors".to_owned();
+    adapter.not_read = Some(NotRead::TooLarge);
+    let mut beside = Case::new().report(LoadReport::default());
+    beside.checkpoint.shards.insert(adapter.name.clone(), adapter);
+    assert_eq!(resting(&beside), [Object::Adapter]);
+}
+
 /// The names of an index tell nothing of a load.
 #[test]
 fn a_model_loads_where_a_shard_was_read() {
