@@ -16,6 +16,8 @@ mod concise;
 #[cfg(feature = "cli")]
 pub mod diff;
 #[cfg(feature = "cli")]
+mod edits;
+#[cfg(feature = "cli")]
 mod excerpt;
 #[cfg(feature = "cli")]
 pub mod fixes;
@@ -27,6 +29,8 @@ pub(crate) mod markdown;
 mod merge;
 pub mod model;
 mod overview;
+#[cfg(feature = "cli")]
+pub mod page;
 #[cfg(feature = "cli")]
 pub mod recipes;
 #[cfg(feature = "cli")]
@@ -75,6 +79,7 @@ pub fn render(report: &Report, format: Format, style: Style) -> String {
         Format::Junit => ci::junit::render(report),
         Format::Sarif => ci::sarif::render(report),
         Format::Markdown => markdown::render(report, style.cap),
+        Format::Html => page::render(report),
     }
 }
 

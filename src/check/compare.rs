@@ -10,8 +10,11 @@ use crate::checkpoint::{Checkpoint, DifferenceRank, Distance, EntryKind, Index, 
 use crate::knowledge::Library;
 
 mod converted;
+mod maps;
 mod renamings;
 mod values;
+
+pub use self::maps::{ChangedCell, ChangesByLayer, changes_by_layer, maps};
 
 /// Maximum number of bytes of another file that is compared. Of a larger one, only another size is found.
 const FILE_CAP: u64 = 64 << 20;

@@ -1,5 +1,6 @@
 //! The summary of a checkpoint: amounts, and the class and config values that its tensors imply.
 
+mod map;
 mod memory;
 mod tensors;
 mod tree;
@@ -15,6 +16,8 @@ use crate::checkpoint::{Checkpoint, Tensor, pointer};
 use crate::knowledge::resemblance::Resemblance;
 use crate::knowledge::{Architecture, Library, Loader};
 
+pub use self::map::{MapProperty, ModuleMap, PropertyKind};
+pub(super) use self::map::{Painted, by_dtype};
 pub use self::memory::{CacheInput, Memory};
 pub use self::tensors::{InspectedTensor, tensors};
 pub use self::tree::InspectedModule;
@@ -143,7 +146,7 @@ pub fn inspect(checkpoint: &Checkpoint, library: &Library, cache: CacheInput) ->
         files: files.collect(),
         tensors,
         dtypes,
-        tree: tree::of(checkpoint),
+        tree: tree::of(checkpoint, &|_, _| ()),
         config: checkpoint.config().map(config_summary),
         classes: Vec::new(),
         votes: None,

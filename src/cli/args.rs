@@ -160,12 +160,9 @@ pub struct InspectArgs {
     /// Sequences of that cache
     #[arg(long, value_name = "N", default_value = "1")]
     pub batch: u64,
-    /// Output format
-    #[arg(long, alias = "format", value_name = "FMT", default_value = "full")]
-    pub output_format: InspectFormat,
-    /// When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`
-    #[arg(long, value_name = "WHEN", default_value = "auto")]
-    pub color: Color,
+    /// Output.
+    #[command(flatten)]
+    pub output: InspectOutput,
 }
 
 /// Arguments of `diff`.
@@ -183,12 +180,9 @@ pub struct DiffArgs {
     /// Compare all bytes, and measure tensors that differ; with =rank also the rank of the difference of two matrices
     #[arg(long, value_name = "WHAT", num_args = 0..=1, require_equals = true, default_missing_value = "values")]
     pub stats: Option<DiffStats>,
-    /// Output format
-    #[arg(long, alias = "format", value_name = "FMT", default_value = "full")]
-    pub output_format: InspectFormat,
-    /// When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`
-    #[arg(long, value_name = "WHEN", default_value = "auto")]
-    pub color: Color,
+    /// Output.
+    #[command(flatten)]
+    pub output: InspectOutput,
 }
 
 /// What `diff --stats` measures.
@@ -200,9 +194,34 @@ pub enum DiffStats {
     Rank,
 }
 
-/// Formats of `inspect`, `diff` and `verify`.
+/// Options for the output of `inspect` and `diff`.
+#[derive(Debug, Args)]
+pub struct InspectOutput {
+    /// Output format
+    #[arg(long, alias = "format", value_name = "FMT", default_value = "full")]
+    pub output_format: InspectFormat,
+    /// Also write the output to a file in any of these formats; may be repeated
+    #[arg(long, value_name = "FMT=FILE", value_parser = parse_inspect_report)]
+    pub report: Vec<(InspectFormat, PathBuf)>,
+    /// When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`
+    #[arg(long, value_name = "WHEN", default_value = "auto")]
+    pub color: Color,
+}
+
+/// Formats of `inspect` and `diff`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum InspectFormat {
+    /// For a terminal
+    Full,
+    /// One JSON object, complete
+    Json,
+    /// A page for a browser, in one file
+    Html,
+}
+
+/// Formats of `verify`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum VerifyFormat {
     /// For a terminal
     Full,
     /// One JSON object, complete
@@ -267,6 +286,13 @@ pub struct ReportArgs {
     /// When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`
     #[arg(long, value_name = "WHEN", default_value = "auto")]
     pub color: Color,
+}
+
+impl ReportArgs {
+    /// Whether a report is made in this format.
+    pub fn has(&self, format: Format) -> bool {
+        self.output_format == format || self.report.iter().any(|(other, _)| *other == format)
+    }
 }
 
 /// The baseline: findings that are accepted because they existed before.
@@ -451,6 +477,15 @@ fn parse_pair(text: &str) -> Result<(String, String), String> {
         Some((name, value)) if !name.is_empty() && !value.is_empty() => Ok((name.to_owned(), value.to_owned())),
         _ => Err("expected NAME=VALUE".to_owned()),
     }
+}
+
+fn parse_inspect_report(text: &str) -> Result<(InspectFormat, PathBuf), String> {
+    let (format, file) = parse_pair(text).map_err(|_| "expected FMT=FILE".to_owned())?;
+    let known = InspectFormat::value_variants().iter().filter_map(InspectFormat::to_possible_value);
+    let known: Vec<String> = known.map(|value| value.get_name().to_owned()).collect();
+    let format = InspectFormat::from_str(&format, false)
+        .map_err(|_| format!("`{format}` is not an output format; known are {}", known.join(", ")))?;
+    Ok((format, PathBuf::from(file)))
 }
 
 fn parse_report(text: &str) -> Result<(Format, PathBuf), String> {

@@ -18,7 +18,7 @@ use crate::knowledge::rule::RuleSet;
 use crate::merge::{self, MergeRequest, MergeRun, ResolvedMergeFile};
 use crate::report::json;
 use crate::report::model::{MergeStage, Role};
-use crate::report::recipes;
+use crate::report::{Format, recipes};
 
 /// Runs `build-merged`.
 pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
@@ -37,7 +37,8 @@ pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     if let (Some(file), Some(plan)) = (&args.how.plan, &run.plan) {
         output::write(file, &json::pretty(plan)).with_context(|| format!("writing {}", file.display()))?;
     }
-    output::finish(&run.report(), &args.how.report, false, false).with_context(|| match stage {
+    let report = if args.how.report.has(Format::Html) { run.report_with_maps() } else { run.report() };
+    output::finish(&report, &args.how.report, false, false).with_context(|| match stage {
         Some(MergeStage::Written) => format!("{} is written, but the report could not be", run.record.out),
         _ => "the report could not be written".to_owned(),
     })?;

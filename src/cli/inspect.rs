@@ -1,20 +1,21 @@
 //! `inspect`.
 
 use crate::checkpoint::files;
+use std::cell::LazyCell;
 use std::path::Path;
 use std::sync::Arc;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, anyhow, bail};
 
 use super::args::{InspectArgs, InspectFormat};
 use super::exit::CLEAN;
 use super::{library, output, paths};
 use crate::check::check;
-use crate::check::inspect::{CacheInput, InspectedTensor, inspect, tensors};
+use crate::check::inspect::{CacheInput, InspectedTensor, ModuleMap, inspect, tensors};
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, Parts, Shard, find_checkpoints};
 use crate::knowledge::directories::Directories;
-use crate::report::inspect as report;
+use crate::report::{inspect as report, page};
 
 /// Runs `inspect`.
 pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
@@ -23,23 +24,23 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let listed = args.tensors.as_ref().map(|glob| list(&checkpoint, path, glob)).transpose()?;
     let name = shown(path);
     let cache = CacheInput { context: args.context, batch: args.batch };
-    let judged = |rules: Option<&Path>| {
+    let judged = LazyCell::new(|| {
         let knowledge = library::knowledge(library::rules(rules)?, rules)?;
         let has = |name: &str| checkpoint.entries.contains_key(name);
         let is_model = [files::CONFIG, files::INDEX, files::ADAPTER_CONFIG].into_iter().any(has);
         let loads = if is_model { check(&checkpoint, &knowledge).verdicts } else { Vec::new() };
         anyhow::Ok((inspect(&checkpoint, &knowledge.library, cache), loads))
-    };
-    output::print(&match (args.output_format, listed) {
-        (InspectFormat::Full, Some(listed)) => report::tensors(&listed),
-        (InspectFormat::Full, None) => {
-            let (inspection, loads) = judged(rules)?;
-            report::full(&name, &inspection, &loads, args.depth, output::style(args.color))
+    });
+    output::look(&args.output, |format, style| {
+        if let (InspectFormat::Full, Some(listed)) = (format, &listed) {
+            return Ok(report::tensors(listed));
         }
-        (InspectFormat::Json, listed) => {
-            let (inspection, loads) = judged(rules)?;
-            report::json(&name, &inspection, &loads, listed.as_deref())
-        }
+        let (inspection, loads) = judged.as_ref().map_err(|error| anyhow!("{error:#}"))?;
+        Ok(match format {
+            InspectFormat::Full => report::full(&name, inspection, loads, args.depth, style),
+            InspectFormat::Json => report::json(&name, inspection, loads, listed.as_deref()),
+            InspectFormat::Html => page::inspection(&name, inspection, loads, &ModuleMap::of(&checkpoint, loads)),
+        })
     })?;
     Ok(CLEAN)
 }

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context;
 
-use super::args::{Color, ReportArgs};
+use super::args::{Color, InspectFormat, InspectOutput, ReportArgs};
 use super::system;
 use crate::report::{Format, Report, Style, render, statistics};
 
@@ -41,6 +41,18 @@ pub fn finish(report: &Report, args: &ReportArgs, counted: bool, quiet: bool) ->
     for (format, file) in &args.report {
         let style = Style { cap: if *format == Format::Full { 20 } else { 1000 }, ..Style::default() };
         write(file, &render(report, *format, style)).with_context(|| format!("writing {}", file.display()))?;
+    }
+    print(&text)
+}
+
+/// Prints what `inspect` or `diff` has to say, and writes the files of `--report`; `render` renders it in a format.
+pub fn look(
+    args: &InspectOutput,
+    render: impl Fn(InspectFormat, Style) -> anyhow::Result<String>,
+) -> anyhow::Result<()> {
+    let text = render(args.output_format, style(args.color))?;
+    for (format, file) in &args.report {
+        write(file, &render(*format, Style::default())?).with_context(|| format!("writing {}", file.display()))?;
     }
     print(&text)
 }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use anyhow::bail;
 
-use super::args::{InspectFormat, VerifyArgs};
+use super::args::{VerifyArgs, VerifyFormat};
 use super::exit::{CLEAN, FAILED, FINDINGS};
 use super::output;
 use crate::merge;
@@ -21,8 +21,8 @@ pub fn run(args: &VerifyArgs) -> anyhow::Result<u8> {
     }
     let verification = merge::verify(&args.path, &donors)?;
     output::print(&match args.output_format {
-        InspectFormat::Full => verification::full(&verification, output::style(args.color)),
-        InspectFormat::Json => verification::json(&verification),
+        VerifyFormat::Full => verification::full(&verification, output::style(args.color)),
+        VerifyFormat::Json => verification::json(&verification),
     })?;
     Ok(match verification.verdict {
         VerificationVerdict::Equal => CLEAN,

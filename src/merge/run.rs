@@ -10,6 +10,7 @@ use super::parts::DonorParts;
 use super::tokenizer::{opened_otherwise, tokens_used};
 use super::training::{name_in_models, training};
 use super::usage::Usage;
+use crate::check::inspect::ModuleMap;
 use crate::check::load::targets;
 use crate::check::options::RunOptions;
 use crate::check::{Finding, Outcome, Severity, check_for};
@@ -18,8 +19,11 @@ use crate::knowledge::parts::ModelParts;
 use crate::knowledge::recipe::Recipe;
 use crate::knowledge::{Knowledge, Loader};
 use crate::report::Report;
-use crate::report::model::{ChangedTensor, CheckpointReport, MergeReport, MergeStage, Role, StageOutcome};
+use crate::report::model::{
+    ChangedTensor, CheckpointMap, CheckpointReport, MergeReport, MergeStage, Role, StageOutcome,
+};
 use crate::surgery::Leftover;
+use crate::surgery::expr::TensorTransform;
 use crate::surgery::plan::Plan;
 use crate::surgery::planned_tensor::PlannedTensor;
 use crate::surgery::transform::ValueFacts;
@@ -63,6 +67,16 @@ pub struct CheckedCheckpoint {
     pub(super) parts: Option<DonorParts>,
 }
 
+impl CheckedCheckpoint {
+    /// The role of a donor, with the donor.
+    fn donor(&self) -> Option<(&str, &Self)> {
+        match &self.role {
+            Role::Donor(role) => Some((role, self)),
+            Role::Planned | Role::Written => None,
+        }
+    }
+}
+
 /// A merge run: the checked checkpoints and the record for the reports.
 #[derive(Debug, Clone, Default)]
 pub struct MergeRun {
@@ -78,6 +92,20 @@ pub struct MergeRun {
     pub(super) versions: Vec<String>,
     /// How the result is loaded.
     usage: Usage,
+    /// Where the tensors of the result come from.
+    origins: Vec<TensorOrigin>,
+}
+
+/// Where a tensor of the result comes from.
+#[derive(Debug, Clone)]
+struct TensorOrigin {
+    /// Its name in the result.
+    name: String,
+    /// Role of the donor that it stands for.
+    donor: String,
+    /// Its name there.
+    from: String,
+    transform: TensorTransform,
 }
 
 impl MergeRun {
@@ -131,9 +159,13 @@ impl MergeRun {
         record.tensors = draft.plan.tensors().count();
         record.bytes = draft.plan.tensor_bytes();
         record.transforms.clear();
+        self.origins.clear();
         for (_, tensor) in draft.plan.tensors() {
-            let count = record.transforms.entry(tensor.transform()).or_default();
+            let (main, transform) = (tensor.source.main(), tensor.transform());
+            let count = record.transforms.entry(transform).or_default();
             *count = count.saturating_add(1);
+            let (name, donor, from) = (tensor.name.clone(), main.donor.clone(), main.name.clone());
+            self.origins.push(TensorOrigin { name, donor, from, transform });
         }
     }
 
@@ -211,6 +243,34 @@ impl MergeRun {
     #[must_use]
     pub fn report(&self) -> Report {
         self.report_with(self.record.clone(), |checked| checked.path.display().to_string())
+    }
+
+    /// The same with maps of the donors and of the result by origin, for a page.
+    #[must_use]
+    pub fn report_with_maps(&self) -> Report {
+        let mut report = self.report();
+        let donors: Vec<(&str, &CheckedCheckpoint)> =
+            self.checked.iter().filter_map(CheckedCheckpoint::donor).collect();
+        let told = |origin: &TensorOrigin| format!("{}: {}", origin.donor, origin.transform.name());
+        // All maps start with the same values, so that a donor has one colour in all of them.
+        let copies = donors.iter().map(|(role, _)| format!("{role}: {}", TensorTransform::Copy.name()));
+        let values = |other: &str| std::iter::once(other.to_owned()).chain(copies.clone()).collect();
+        for (role, checked) in &donors {
+            let used = self.origins.iter().filter(|origin| origin.donor == *role);
+            let used = used.map(|origin| (origin.from.as_str(), told(origin)));
+            report.maps.push(CheckpointMap {
+                title: format!("{role}: what was taken"),
+                map: ModuleMap::by_origin(&checked.checkpoint, values("left out"), used),
+            });
+        }
+        if let Some(result) = self.checked.iter().rfind(|checked| checked.donor().is_none()) {
+            let made = self.origins.iter().map(|origin| (origin.name.as_str(), told(origin)));
+            report.maps.push(CheckpointMap {
+                title: result.role.to_string(),
+                map: ModuleMap::by_origin(&result.checkpoint, values("unknown"), made),
+            });
+        }
+        report
     }
 
     /// The report without the names of directories, for the file inside the result: the same merge of donors that lie

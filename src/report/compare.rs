@@ -186,7 +186,7 @@ fn amount(Distances { by, ranks }: Distances) -> String {
 }
 
 /// A number with three decimals, or with an exponent where these would tell little.
-fn figures(number: f64) -> String {
+pub(super) fn figures(number: f64) -> String {
     if number == 0.0 || (0.001..1000.0).contains(&number) { format!("{number:.3}") } else { format!("{number:.2e}") }
 }
 
@@ -209,6 +209,7 @@ fn section(out: &mut String, title: &str, lines: impl Iterator<Item = String>, f
     }
 }
 
-fn value(value: Option<&Value>) -> String {
+/// A value of a document, shortened; `missing` without one.
+pub(super) fn value(value: Option<&Value>) -> String {
     value.map_or_else(|| "missing".to_owned(), |value| escape(&value.to_string(), VALUE))
 }

@@ -2,9 +2,12 @@
 //!
 //! The size of the result is limited: a `tokenizer.json` may have 20 MB on one line.
 
+use std::collections::BTreeSet;
 use std::ops::Range;
 
 use super::format::hostile;
+use super::model::CheckpointReport;
+use crate::check::Location;
 
 /// Bytes kept before the first mark of a long line.
 const BEFORE: usize = 60;
@@ -25,8 +28,44 @@ pub struct Excerpt {
 }
 
 /// Whether a span can share an excerpt with an earlier one.
-pub fn near(first: &Range<usize>, next: &Range<usize>) -> bool {
+fn near(first: &Range<usize>, next: &Range<usize>) -> bool {
     next.start.checked_sub(first.start).is_some_and(|distance| distance <= APART)
+}
+
+/// One place: locations that share an excerpt, or a single location without one.
+pub struct FilePlaces<'a> {
+    /// The locations, in order.
+    pub locations: Vec<&'a Location>,
+    /// The text of the file, if the locations are ranges in it.
+    pub source: Option<&'a str>,
+}
+
+/// Groups locations in order: neighbours in one file together, and a file without a span once.
+pub fn gather<'a>(locations: &'a [Location], checkpoint: &'a CheckpointReport) -> Vec<FilePlaces<'a>> {
+    let mut places: Vec<FilePlaces<'a>> = Vec::new();
+    let mut bare = BTreeSet::new();
+    for location in locations {
+        let Some(file) = location.file.as_deref() else { continue };
+        let source = checkpoint.sources.get(file).map(AsRef::as_ref).filter(|_| location.span.is_some());
+        if source.is_none() && !bare.insert((file, location.line, location.column, &location.pointer)) {
+            continue;
+        }
+        match places.last_mut() {
+            Some(place) if source.is_some() && place.source.is_some() && shares(place, location) => {
+                place.locations.push(location);
+            }
+            _ => places.push(FilePlaces { locations: vec![location], source }),
+        }
+    }
+    places
+}
+
+fn shares(place: &FilePlaces<'_>, location: &Location) -> bool {
+    let (Some(first), Some(last)) = (place.locations.first(), place.locations.last()) else { return false };
+    match (&first.span, &last.span, &location.span) {
+        (Some(a), Some(b), Some(c)) => first.file == location.file && near(a, c) && c.start >= b.start,
+        _ => false,
+    }
 }
 
 /// Cuts out the lines around `spans`, which are sorted and pairwise [`near`].

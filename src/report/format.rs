@@ -260,7 +260,7 @@ pub fn capped(findings: &[Finding], cap: usize) -> (Vec<&Finding>, Vec<(&str, us
     (shown, hidden.collect())
 }
 
-/// Merges consecutive findings that differ only in their places.
+/// Merges consecutive findings that differ only in their places and in the edits there.
 pub fn alike(findings: Vec<&Finding>) -> Vec<Finding> {
     let mut together: Vec<Finding> = Vec::new();
     for finding in findings {
@@ -271,7 +271,12 @@ pub fn alike(findings: Vec<&Finding>) -> Vec<Finding> {
                 && last.details == finding.details
         };
         match together.last_mut() {
-            Some(last) if same(last) => last.locations.extend(finding.locations.iter().cloned()),
+            Some(last) if same(last) => {
+                last.locations.extend(finding.locations.iter().cloned());
+                if let Some((all, more)) = last.fix.as_mut().zip(finding.fix.as_ref()) {
+                    all.edits.extend(more.edits.iter().cloned());
+                }
+            }
             _ => together.push(finding.clone()),
         }
     }

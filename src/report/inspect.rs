@@ -8,6 +8,7 @@ use std::fmt::Write as _;
 use serde::Serialize;
 
 use self::columns::{Align, WIDTH, columns};
+pub(super) use self::tree::label;
 use super::Style;
 use super::format::{and, bytes, headline, more, name, objects, plural, scaled, sentence, shape, wrap};
 use super::json::pretty;
@@ -302,7 +303,7 @@ fn percent(share: f64) -> String {
 }
 
 /// `7.08 billion`.
-fn count(n: u64) -> String {
+pub(super) fn count(n: u64) -> String {
     scaled(n, [(" billion", 1_000_000_000), (" million", 1_000_000), (" thousand", 1_000)])
 }
 

@@ -10,6 +10,7 @@ pub use super::merge::{
     Role, Seam, ShapedName, StageOutcome, TokenIds, TrainedTensor, Training,
 };
 use crate::check::finding::Suppressed;
+use crate::check::inspect::ModuleMap;
 use crate::check::verdict::PredictedLoad;
 use crate::check::{Finding, Severity};
 use crate::checkpoint::{TensorContents, untold};
@@ -35,6 +36,18 @@ pub struct Report {
     pub unchecked: Vec<UncheckedPath>,
     /// Totals over all checkpoints.
     pub summary: Summary,
+    /// Maps for a page; empty unless one was asked for.
+    #[serde(skip)]
+    pub(crate) maps: Vec<CheckpointMap>,
+}
+
+/// The map of a checkpoint of the run.
+#[derive(Debug, Clone)]
+pub(crate) struct CheckpointMap {
+    /// What it shows.
+    pub(crate) title: String,
+    /// The map.
+    pub(crate) map: ModuleMap,
 }
 
 impl Report {
@@ -46,7 +59,8 @@ impl Report {
         let verdict = if seams { Verdict::Error } else { counts.verdict() };
         let suppressed = checkpoints.iter().map(|c| c.suppressed.len()).sum();
         let summary = Summary { checkpoints: checkpoints.len(), verdict, counts, suppressed, unchecked: 0, hidden: 0 };
-        Self { schema: 3, tool: ToolInfo::this(), checkpoints, merge, unchecked: Vec::new(), summary }.graded()
+        Self { schema: 3, tool: ToolInfo::this(), checkpoints, merge, unchecked: Vec::new(), summary, maps: Vec::new() }
+            .graded()
     }
 
     /// Adds the paths that could not be checked; without findings of severity error, they determine the verdict.

@@ -52,6 +52,15 @@ impl<'a> OverviewRow<'a> {
     }
 }
 
+/// The length of the folder that all paths share, with its slash; 0 without one.
+#[cfg(feature = "cli")]
+pub fn shared_folder(paths: &[&str]) -> usize {
+    let Some(first) = paths.first() else { return 0 };
+    let is_shared = |folder: &&str| paths.iter().all(|path| path.starts_with(*folder));
+    let folders = first.rmatch_indices('/').filter_map(|(at, slash)| first.get(..at.saturating_add(slash.len())));
+    folders.into_iter().find(is_shared).map_or(0, str::len)
+}
+
 /// The numbers of a version, for sorting.
 fn version(text: &str) -> Vec<u64> {
     text.split('.').map(|part| part.parse().unwrap_or(0)).collect()

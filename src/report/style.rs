@@ -27,11 +27,13 @@ pub enum Format {
     Sarif,
     /// Markdown without times and directories.
     Markdown,
+    /// A page for a browser, in one file.
+    Html,
 }
 
 impl Format {
     /// Every format.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 11] = [
         Self::Full,
         Self::Table,
         Self::Concise,
@@ -42,6 +44,7 @@ impl Format {
         Self::Junit,
         Self::Sarif,
         Self::Markdown,
+        Self::Html,
     ];
 
     /// The name on the command line.
@@ -58,6 +61,7 @@ impl Format {
             Self::Junit => "junit",
             Self::Sarif => "sarif",
             Self::Markdown => "markdown",
+            Self::Html => "html",
         }
     }
 }
@@ -71,7 +75,7 @@ impl fmt::Display for Format {
 /// An unknown format name.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "`{0}` is not an output format; known are full, table, concise, json, jsonl, github, gitlab, junit, sarif, markdown"
+    "`{0}` is not an output format; known are full, table, concise, json, jsonl, github, gitlab, junit, sarif, markdown, html"
 )]
 pub struct UnknownFormat(String);
 

@@ -20,7 +20,7 @@ from pathlib import Path
 PROJECT = Path(__file__).resolve().parents[2]
 DONORS = PROJECT / "fixtures/donors"
 BATCH = 20
-FORMATS = ["full", "concise", "sarif", "gitlab", "github", "junit", "markdown"]
+FORMATS = ["full", "concise", "sarif", "gitlab", "github", "junit", "markdown", "html"]
 # Names that leave the directory, are devices, or mean another file on Windows.
 NAMES = [
     "..\\model.safetensors",

@@ -44,7 +44,7 @@ STATE = os.path.realpath(user_state.FOLDER)
 ITSELF = "/proc/self/exe"
 # Below /proc/PID of the process itself.
 OF_ITSELF = ("maps", "cgroup", "mountinfo", "status")
-FORMATS = ("full", "concise", "json", "jsonl", "markdown", "sarif", "github", "gitlab", "junit")
+FORMATS = ("full", "concise", "json", "jsonl", "markdown", "sarif", "github", "gitlab", "junit", "html")
 # Keys of documents that make a loader fetch or run code; a merge may write an `auto_map` of its own.
 SWITCHES = (
     "custom_pipelines", "trust_remote_code", "_attn_implementation", "_attn_implementation_internal", "_experts_implementation",

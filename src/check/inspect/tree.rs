@@ -23,15 +23,24 @@ pub struct InspectedModule {
     /// The tensors inside, of all modules of the run together.
     #[serde(flatten)]
     pub amount: Amount,
+    /// Bytes by the values of the properties of a [`ModuleMap`](super::ModuleMap), in their order; empty without a map.
+    #[serde(skip)]
+    pub shares: Vec<u64>,
     /// The modules inside, and the tensors beside these. Empty for a module that has only tensors, and for a tensor.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub modules: Vec<Self>,
 }
 
+/// Adds the bytes of a tensor to the shares of a module.
+pub(super) type AddShares<'s> = &'s dyn Fn(&Tensor, &mut Vec<u64>);
+
 impl InspectedModule {
     /// Adds the amounts of a module with the same tensors inside.
     fn absorb(&mut self, other: &Self) {
         self.amount.merge(other.amount);
+        for (own, other) in self.shares.iter_mut().zip(&other.shares) {
+            *own = own.saturating_add(*other);
+        }
         for (own, other) in self.modules.iter_mut().zip(&other.modules) {
             own.absorb(other);
         }
@@ -39,19 +48,14 @@ impl InspectedModule {
 }
 
 /// The modules of a checkpoint, in the order of their names. A module that has one module and nothing else is joined with it.
-pub(super) fn of(checkpoint: &Checkpoint) -> Vec<InspectedModule> {
+pub(super) fn of(checkpoint: &Checkpoint, add: AddShares<'_>) -> Vec<InspectedModule> {
     let mut sorted: Vec<&Tensor> = checkpoint.tensors().map(|(_, tensor)| tensor).collect();
     sorted.sort_by(|a, b| in_order(&a.name, &b.name));
-    tree(&sorted)
-}
-
-/// The modules of sorted tensors.
-fn tree(sorted: &[&Tensor]) -> Vec<InspectedModule> {
-    modules(sorted, 0, 1)
+    modules(&sorted, 0, 1, add)
 }
 
 /// The modules at one level of the tree: `outer` bytes of the names are those of the module around them and its dot.
-fn modules(tensors: &[&Tensor], outer: usize, level: usize) -> Vec<InspectedModule> {
+fn modules(tensors: &[&Tensor], outer: usize, level: usize, add: AddShares<'_>) -> Vec<InspectedModule> {
     if level > 1 && tensors.iter().all(|tensor| split(tensor, outer, level).1.is_none()) {
         return Vec::new();
     }
@@ -65,7 +69,7 @@ fn modules(tensors: &[&Tensor], outer: usize, level: usize) -> Vec<InspectedModu
             None => runs.push(Run(vec![one])),
         }
     }
-    runs.iter().filter_map(|run| run.module(level)).collect()
+    runs.iter().filter_map(|run| run.module(level, add)).collect()
 }
 
 /// The part of a name at a level, and what follows its dot.
@@ -107,14 +111,17 @@ impl Group<'_, '_> {
         self.tensors.len() == other.tensors.len() && self.tensors.iter().zip(other.tensors).all(alike)
     }
 
-    fn module(&self, level: usize) -> InspectedModule {
-        let mut amount = Amount::default();
-        self.tensors.iter().for_each(|tensor| amount.add(tensor));
+    fn module(&self, level: usize, add: AddShares<'_>) -> InspectedModule {
+        let (mut amount, mut shares) = (Amount::default(), Vec::new());
+        for tensor in self.tensors {
+            amount.add(tensor);
+            add(tensor, &mut shares);
+        }
         // A tensor that has the name of the module is first.
         let own = self.tensors.iter().take_while(|tensor| tensor.name.len() <= self.end).count();
         let inner = self.tensors.get(own..).unwrap_or_default();
-        let modules = modules(inner, self.end.saturating_add(1), level.saturating_add(1));
-        InspectedModule { name: self.name(), last: None, repeats: 1, amount, modules }
+        let modules = modules(inner, self.end.saturating_add(1), level.saturating_add(1), add);
+        InspectedModule { name: self.name(), last: None, repeats: 1, amount, shares, modules }
     }
 }
 
@@ -128,11 +135,11 @@ impl Run<'_, '_> {
         self.0.last().is_some_and(|last| follows(last) && last.is_like(next))
     }
 
-    fn module(&self, level: usize) -> Option<InspectedModule> {
+    fn module(&self, level: usize, add: AddShares<'_>) -> Option<InspectedModule> {
         let (first, others) = self.0.split_first()?;
-        let mut module = first.module(level);
+        let mut module = first.module(level, add);
         for other in others {
-            module.absorb(&other.module(level));
+            module.absorb(&other.module(level, add));
             module.repeats = module.repeats.saturating_add(1);
         }
         module.last = others.last().map(Group::name);
@@ -145,7 +152,7 @@ impl Run<'_, '_> {
 
 #[cfg(test)]
 mod tests {
-    use super::{InspectedModule, Tensor, in_order, tree};
+    use super::{InspectedModule, Tensor, in_order, modules};
     use crate::checkpoint::Dtype;
 
     fn lines(modules: &[InspectedModule], indent: &str, out: &mut Vec<String>) {
@@ -169,7 +176,7 @@ mod tests {
         let mut sorted: Vec<&Tensor> = tensors.iter().collect();
         sorted.sort_by(|a, b| in_order(&a.name, &b.name));
         let mut out = Vec::new();
-        lines(&tree(&sorted), "", &mut out);
+        lines(&modules(&sorted, 0, 1, &|_, _| ()), "", &mut out);
         out
     }
 

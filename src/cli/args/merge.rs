@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
-use super::{Color, InspectFormat, ReportArgs, hidden_rules, parse_pair};
+use super::{Color, ReportArgs, VerifyFormat, hidden_rules, parse_pair};
 use crate::checkpoint::HashAlgorithm;
 use crate::cli::pins::or_file;
 use crate::knowledge::loader::parse_requirement_or_all;
@@ -62,7 +62,7 @@ pub struct VerifyArgs {
     pub donor: Vec<(String, String)>,
     /// Output format
     #[arg(long, alias = "format", value_name = "FMT", default_value = "full")]
-    pub output_format: InspectFormat,
+    pub output_format: VerifyFormat,
     /// When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`
     #[arg(long, value_name = "WHEN", default_value = "auto")]
     pub color: Color,

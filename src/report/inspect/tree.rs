@@ -86,7 +86,7 @@ impl Cut {
 }
 
 /// The name of a module below the one around it: `layers.0–31 ×32`.
-fn label(module: &InspectedModule, outer: &str) -> String {
+pub fn label(module: &InspectedModule, outer: &str) -> String {
     let inner = module.name.strip_prefix(outer).unwrap_or(&module.name);
     let inner = if outer.is_empty() { inner } else { inner.strip_prefix('.').unwrap_or(inner) };
     let Some(last) = &module.last else { return name(inner) };

@@ -1,16 +1,15 @@
 //! Renders one finding with its places.
 
-use std::collections::BTreeSet;
 use std::ops::Range;
 
 use annotate_snippets::{AnnotationKind, Element, Group, Level, Origin, Renderer, Snippet};
 
 use super::super::Style;
-use super::super::excerpt::{cut, near};
+use super::super::excerpt::{FilePlaces, cut, gather};
 use super::super::fixes::mark;
 use super::super::format::{advice, details, more, name, place, sentence, tensors, wrap};
 use super::super::model::CheckpointReport;
-use crate::check::{Finding, Location, Severity};
+use crate::check::{Finding, Severity};
 use crate::checkpoint::line_column;
 
 /// Maximum number of places shown for one finding.
@@ -54,40 +53,6 @@ pub fn render(finding: &Finding, checkpoint: &CheckpointReport, style: Style) ->
     }
     // Without line numbers for alignment, arrows and notes would start at the left margin.
     if shown.iter().all(|one| !one.excerpt) { text.replace('\n', "\n ") } else { text }
-}
-
-/// One place: locations that share an excerpt, or a single location without one.
-struct FilePlaces<'a> {
-    locations: Vec<&'a Location>,
-    source: Option<&'a str>,
-}
-
-/// Groups locations in order: neighbours in one file together, and a file without a span once.
-fn gather<'a>(locations: &'a [Location], checkpoint: &'a CheckpointReport) -> Vec<FilePlaces<'a>> {
-    let mut places: Vec<FilePlaces<'a>> = Vec::new();
-    let mut bare = BTreeSet::new();
-    for location in locations {
-        let Some(file) = location.file.as_deref() else { continue };
-        let source = checkpoint.sources.get(file).map(AsRef::as_ref).filter(|_| location.span.is_some());
-        if source.is_none() && !bare.insert((file, location.line, location.column, &location.pointer)) {
-            continue;
-        }
-        match places.last_mut() {
-            Some(place) if source.is_some() && place.source.is_some() && shares(place, location) => {
-                place.locations.push(location);
-            }
-            _ => places.push(FilePlaces { locations: vec![location], source }),
-        }
-    }
-    places
-}
-
-fn shares(place: &FilePlaces<'_>, location: &Location) -> bool {
-    let (Some(first), Some(last)) = (place.locations.first(), place.locations.last()) else { return false };
-    match (&first.span, &last.span, &location.span) {
-        (Some(a), Some(b), Some(c)) => first.file == location.file && near(a, c) && c.start >= b.start,
-        _ => false,
-    }
 }
 
 /// A rendered place.

@@ -7,7 +7,7 @@ use comfy_table::{CellAlignment, Table, presets};
 use super::super::Style;
 use super::super::format::{bytes, name, scaled};
 use super::super::model::Verdict;
-use super::super::overview::{Overview, OverviewRow};
+use super::super::overview::{Overview, OverviewRow, shared_folder};
 use super::paint::Paint;
 use crate::check::verdict::LoadVerdict;
 
@@ -105,10 +105,8 @@ fn columns_width(rows: &[Vec<String>]) -> usize {
 
 /// Removes the folder that all paths share.
 fn without_folder(names: &mut [(String, String)]) {
-    let Some((first, _)) = names.first() else { return };
-    let is_shared = |folder: &&str| names.iter().all(|(path, _)| path.starts_with(*folder));
-    let folders = first.rmatch_indices('/').filter_map(|(at, slash)| first.get(..at.saturating_add(slash.len())));
-    let Some(shared) = folders.into_iter().find(is_shared).map(str::len) else { return };
+    let paths: Vec<&str> = names.iter().map(|(path, _)| path.as_str()).collect();
+    let shared = shared_folder(&paths);
     for (path, _) in names {
         path.drain(..shared);
     }

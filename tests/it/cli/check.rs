@@ -143,7 +143,7 @@ fn paths_that_cannot_be_checked_do_not_lose_the_other_reports() {
     let unchecked: Vec<&Value> = report["unchecked"].as_array().unwrap().iter().map(|u| &u["path"]).collect();
     assert_eq!(unchecked, ["missing", "empty", "gguf/llama-3-8b-Q4_K_M.gguf", "gguf", "zero", "two"]);
     assert_eq!((&report["summary"]["unchecked"], &report["summary"]["verdict"]), (&json!(6), &json!("error")));
-    for format in ["full", "concise", "jsonl", "github", "gitlab", "junit", "sarif", "markdown"] {
+    for format in ["full", "concise", "jsonl", "github", "gitlab", "junit", "sarif", "markdown", "html"] {
         let (shown, _) = run(format);
         assert!(shown.contains("FIL009"), "{format}: {shown}");
         let names = shown.contains("llama-3-8b-Q4_K_M.gguf is GGUF, which is not read");

@@ -134,7 +134,8 @@ fn a_verdict_under_settings_says_so_in_every_format() {
     let room = TempDir::new().unwrap();
     base(&room.path().join("model"));
     comma(&room.path().join("model"));
-    let formats = ["full", "table", "concise", "json", "jsonl", "github", "gitlab", "junit", "sarif", "markdown"];
+    let formats =
+        ["full", "table", "concise", "json", "jsonl", "github", "gitlab", "junit", "sarif", "markdown", "html"];
     for silencing in &SILENCING[..6] {
         fs::write(room.path().join("ckpt-doctor.json5"), silencing).unwrap();
         for format in formats {

@@ -123,7 +123,8 @@ fn hold(secrets: &[PathBuf], before: &[Vec<u8>], context: &str) {
 
 #[test]
 fn no_file_outside_reaches_a_report_or_a_copy() {
-    let formats = ["full", "table", "concise", "json", "jsonl", "github", "gitlab", "junit", "sarif", "markdown"];
+    let formats =
+        ["full", "table", "concise", "json", "jsonl", "github", "gitlab", "junit", "sarif", "markdown", "html"];
     for seed in 0..cases(24) {
         let mut draw = Draw::new(seed);
         let room = TempDir::new().unwrap();

@@ -65,7 +65,8 @@ github\t''
 gitlab\t''
 junit\t''
 sarif\t''
-markdown\t''"
+markdown\t''
+html\t''"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l report -d 'Also write the report to a file in any of these formats; may be repeated' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand check" -l fail-on -d 'Lowest severity that makes the exit code 1 [default: error]' -r -f -a "info\t'All findings'
 warning\t'Warnings and errors'
@@ -120,7 +121,8 @@ github\t''
 gitlab\t''
 junit\t''
 sarif\t''
-markdown\t''"
+markdown\t''
+html\t''"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l report -d 'Also write the report to a file in any of these formats; may be repeated' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand build-merged" -l fail-on -d 'Lowest severity that makes the exit code 1 [default: error]' -r -f -a "info\t'All findings'
 warning\t'Warnings and errors'
@@ -156,7 +158,8 @@ github\t''
 gitlab\t''
 junit\t''
 sarif\t''
-markdown\t''"
+markdown\t''
+html\t''"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l report -d 'Also write the report to a file in any of these formats; may be repeated' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge" -l fail-on -d 'Lowest severity that makes the exit code 1 [default: error]' -r -f -a "info\t'All findings'
 warning\t'Warnings and errors'
@@ -189,7 +192,8 @@ github\t''
 gitlab\t''
 junit\t''
 sarif\t''
-markdown\t''"
+markdown\t''
+html\t''"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l report -d 'Also write the report to a file in any of these formats; may be repeated' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand extract" -l fail-on -d 'Lowest severity that makes the exit code 1 [default: error]' -r -f -a "info\t'All findings'
 warning\t'Warnings and errors'
@@ -222,7 +226,8 @@ github\t''
 gitlab\t''
 junit\t''
 sarif\t''
-markdown\t''"
+markdown\t''
+html\t''"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l report -d 'Also write the report to a file in any of these formats; may be repeated' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand insert" -l fail-on -d 'Lowest severity that makes the exit code 1 [default: error]' -r -f -a "info\t'All findings'
 warning\t'Warnings and errors'
@@ -253,7 +258,8 @@ github\t''
 gitlab\t''
 junit\t''
 sarif\t''
-markdown\t''"
+markdown\t''
+html\t''"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l report -d 'Also write the report to a file in any of these formats; may be repeated' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand merge-adapter" -l fail-on -d 'Lowest severity that makes the exit code 1 [default: error]' -r -f -a "info\t'All findings'
 warning\t'Warnings and errors'
@@ -281,7 +287,9 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l tens
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l context -d 'Tokens of the cache whose memory is estimated [default: the longest input that the config names]' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l batch -d 'Sequences of that cache' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l output-format -d 'Output format' -r -f -a "full\t'For a terminal'
-json\t'One JSON object, complete'"
+json\t'One JSON object, complete'
+html\t'A page for a browser, in one file'"
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l report -d 'Also write the output to a file in any of these formats; may be repeated' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -l color -d 'When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`' -r -f -a "auto\t'On a terminal'
 always\t'Always'
 never\t'Never'"
@@ -291,7 +299,9 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand inspect" -s V -l
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l stats -d 'Compare all bytes, and measure tensors that differ; with =rank also the rank of the difference of two matrices' -r -f -a "values\t'Norm and largest value of the difference, and the cosine of the angle'
 rank\t'These, and the rank of the difference'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l output-format -d 'Output format' -r -f -a "full\t'For a terminal'
-json\t'One JSON object, complete'"
+json\t'One JSON object, complete'
+html\t'A page for a browser, in one file'"
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l report -d 'Also write the output to a file in any of these formats; may be repeated' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -l color -d 'When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`' -r -f -a "auto\t'On a terminal'
 always\t'Always'
 never\t'Never'"
@@ -302,7 +312,9 @@ complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand diff" -s V -l ve
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l stats -d 'Compare all bytes, and measure tensors that differ; with =rank also the rank of the difference of two matrices' -r -f -a "values\t'Norm and largest value of the difference, and the cosine of the angle'
 rank\t'These, and the rank of the difference'"
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l output-format -d 'Output format' -r -f -a "full\t'For a terminal'
-json\t'One JSON object, complete'"
+json\t'One JSON object, complete'
+html\t'A page for a browser, in one file'"
+complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l report -d 'Also write the output to a file in any of these formats; may be repeated' -r
 complete -c ckpt-doctor -n "__fish_ckpt_doctor_using_subcommand compare" -l color -d 'When to print colours; auto respects `NO_COLOR`, `FORCE_COLOR`, `CLICOLOR` and `TERM=dumb`' -r -f -a "auto\t'On a terminal'
 always\t'Always'
 never\t'Never'"

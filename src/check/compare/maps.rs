@@ -1,0 +1,152 @@
+//! What changed where: maps of both checkpoints, and the changes by layer.
+
+use std::collections::{BTreeMap, HashMap};
+
+use super::{Differences, TensorDifferences};
+use crate::check::inspect::{MapProperty, ModuleMap, Painted, PropertyKind, by_dtype};
+use crate::checkpoint::{Checkpoint, Distance, Shard, Tensor};
+
+/// Rows of the table by layer: the kinds of tensors that changed the most.
+const ROWS: usize = 60;
+/// Columns of the table by layer.
+const COLUMNS: usize = 200;
+
+/// The maps of two compared checkpoints: the first by what became of its tensors, the second by those that it alone has.
+/// Called for the page of `diff`, with what [`compare`](super::compare) found.
+#[must_use]
+pub fn maps(one: &Checkpoint, other: &Checkpoint, differences: &Differences) -> [ModuleMap; 2] {
+    let found = &differences.tensors;
+    let kept = if found.equal == unlisted(one, found) { "equal" } else { "equal or not compared" };
+    let lists: [(&str, Vec<&str>); 5] = [
+        (kept, Vec::new()),
+        ("changed", found.changed.iter().map(|one| one.name.as_str()).collect()),
+        ("recast", found.recast.iter().map(|one| one.name.as_str()).collect()),
+        ("reshaped", found.reshaped.iter().map(|one| one.name.as_str()).collect()),
+        ("removed", found.removed.iter().map(|one| one.name.as_str()).collect()),
+    ];
+    let added = [("in both", Vec::new()), ("added", found.added.iter().map(|one| one.name.as_str()).collect())];
+    let map = |checkpoint: &Checkpoint, lists: &[(&str, Vec<&str>)]| {
+        ModuleMap::new(checkpoint, &[by_list(lists), by_dtype(checkpoint)])
+    };
+    [map(one, &lists), map(other, &added)]
+}
+
+/// Tensors of the first checkpoint that no list of differences names.
+fn unlisted(one: &Checkpoint, found: &TensorDifferences) -> usize {
+    let all: std::collections::BTreeSet<&str> = one.tensors().map(|(_, tensor)| tensor.name.as_str()).collect();
+    let named = [found.changed.len(), found.recast.len(), found.reshaped.len(), found.removed.len()];
+    all.len().saturating_sub(named.into_iter().fold(0, usize::saturating_add))
+}
+
+/// By lists of names; the first list has those that no other one names.
+fn by_list<'p>(lists: &[(&str, Vec<&'p str>)]) -> Painted<'p> {
+    let places = lists.iter().enumerate().flat_map(|(at, (_, names))| names.iter().map(move |name| (*name, at)));
+    let of: HashMap<&str, usize> = places.collect();
+    let value = move |_: &Shard, tensor: &Tensor| of.get(tensor.name.as_str()).copied().unwrap_or_default();
+    let values = lists.iter().map(|(value, _)| (*value).to_owned()).collect();
+    Painted { property: MapProperty { kind: PropertyKind::Change, values }, value: Box::new(value) }
+}
+
+/// The tensors that differ in their bytes, by layer: a row for each kind of tensor, a column for each number of a layer.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct ChangesByLayer {
+    /// Numbers of the layers, ascending.
+    pub layers: Vec<u64>,
+    /// Kinds of tensors, those that changed the most first.
+    pub rows: Vec<ChangedKind>,
+    /// Kinds that changed and are not among the rows.
+    pub further: usize,
+}
+
+/// Tensors whose names differ only in numbers.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct ChangedKind {
+    /// Their names, with `*` for the number of the layer and `#` for other numbers.
+    pub pattern: String,
+    /// For each layer what changed there; `None` for a layer without such a tensor.
+    pub cells: Vec<Option<ChangedCell>>,
+}
+
+/// The tensors of one kind in one layer.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct ChangedCell {
+    /// All of them.
+    pub tensors: usize,
+    /// Those with other bytes.
+    pub changed: usize,
+    /// How far these are from the first checkpoint's; missing unless it was measured for all of them.
+    pub by: Option<Distance>,
+}
+
+impl ChangedCell {
+    /// Counts a tensor with other bytes, and how far it is from the first checkpoint's.
+    fn change(&mut self, by: Option<Distance>) {
+        self.by = if self.changed == 0 { by } else { self.by.zip(by).map(|(one, other)| one.and(other)) };
+        self.changed = self.changed.saturating_add(1);
+    }
+}
+
+/// The changed tensors of the first checkpoint by layer. Called for the page of `diff`.
+#[must_use]
+pub fn changes_by_layer(one: &Checkpoint, found: &TensorDifferences) -> ChangesByLayer {
+    let changed = found.changed.iter().map(|one| (one.name.as_str(), one.by));
+    let recast = found.recast.iter().map(|one| (one.name.as_str(), one.by));
+    let changes: HashMap<&str, Option<Distance>> = changed.chain(recast).collect();
+    let mut kinds: BTreeMap<String, BTreeMap<u64, ChangedCell>> = BTreeMap::new();
+    for (_, tensor) in one.tensors() {
+        let Some((pattern, layer)) = kind(&tensor.name) else { continue };
+        let cell = kinds.entry(pattern).or_default().entry(layer).or_default();
+        cell.tensors = cell.tensors.saturating_add(1);
+        if let Some(by) = changes.get(tensor.name.as_str()) {
+            cell.change(*by);
+        }
+    }
+    kinds.retain(|_, cells| cells.len() > 1 && cells.values().any(|cell| cell.changed > 0));
+    let mut layers: Vec<u64> = kinds.values().flat_map(|cells| cells.keys().copied()).collect();
+    layers.sort_unstable();
+    layers.dedup();
+    layers.truncate(COLUMNS);
+    let row = |(pattern, cells): (String, BTreeMap<u64, ChangedCell>)| ChangedKind {
+        pattern,
+        cells: layers.iter().map(|layer| cells.get(layer).copied()).collect(),
+    };
+    let mut rows: Vec<ChangedKind> = kinds.into_iter().map(row).collect();
+    let further = rows.len().saturating_sub(ROWS);
+    rows.sort_by(|a, b| b.most().total_cmp(&a.most()));
+    rows.truncate(ROWS);
+    ChangesByLayer { layers, rows, further }
+}
+
+impl ChangedKind {
+    /// The largest relative change; of kinds that were not measured, all are alike.
+    fn most(&self) -> f64 {
+        let cells = self.cells.iter().flatten().filter(|cell| cell.changed > 0);
+        cells.map(|cell| cell.by.and_then(Distance::relative).unwrap_or_default()).fold(0.0, f64::max)
+    }
+}
+
+/// The name of a tensor with `*` for its first number and `#` for others, and that number.
+fn kind(name: &str) -> Option<(String, u64)> {
+    let mut layer = None;
+    let mut part = |part: &str| match part.parse::<u64>() {
+        Ok(number) if layer.is_none() => {
+            layer = Some(number);
+            "*".to_owned()
+        }
+        Ok(_) => "#".to_owned(),
+        Err(_) => part.to_owned(),
+    };
+    let parts: Vec<String> = name.split('.').map(&mut part).collect();
+    Some((parts.join("."), layer?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::kind;
+
+    #[test]
+    fn the_first_number_is_the_layer() {
+        assert_eq!(kind("m.layers.3.experts.7.w"), Some(("m.layers.*.experts.#.w".to_owned(), 3)));
+        assert_eq!(kind("lm_head.weight"), None);
+    }
+}
