@@ -115,13 +115,18 @@ const fn side(column: Column) -> &'static str {
     }
 }
 
-/// A list of sentences below a heading; nothing without any. Items are HTML.
-fn list(out: &mut String, title: &str, items: &[String]) {
+/// A list of sentences below a heading of the page; nothing without any. Items are HTML.
+fn titled(out: &mut String, title: &str, items: &[String]) {
+    if !items.is_empty() {
+        let _ok = writeln!(out, "<h2>{}</h2>", text(title));
+        list(out, items);
+    }
+}
+
+/// A list of sentences; nothing without any. Items are HTML.
+fn list(out: &mut String, items: &[String]) {
     if items.is_empty() {
         return;
-    }
-    if !title.is_empty() {
-        let _ok = writeln!(out, "<h3>{}</h3>", text(title));
     }
     let _ok = writeln!(out, "<ul>\n<li>{}</li>\n</ul>", items.join("</li>\n<li>"));
 }

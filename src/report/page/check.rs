@@ -10,7 +10,7 @@ use super::super::format::{
 use super::super::inspect::count;
 use super::super::model::{CheckpointReport, Report, Verdict};
 use super::super::overview::{Overview, OverviewRow, shared_folder};
-use super::{Column, code, finding, list, merge, page, table, text, verdict, words};
+use super::{Column, code, finding, list, merge, page, table, text, titled, verdict, words};
 use crate::check::load::LoadReport;
 use crate::check::verdict::{LoadVerdict, PredictedLoad};
 use crate::checkpoint::files::Object;
@@ -31,12 +31,12 @@ pub fn render(report: &Report) -> String {
     if let Some(merge) = &report.merge {
         merge::maps(&mut body, &report.maps);
         merge::render(&mut body, merge);
-    } else if !report.checkpoints.is_empty() {
-        models(&mut body, &Overview::new(report));
+    } else if let Some(overview) = Overview::of_several(report) {
+        models(&mut body, &overview);
     }
     if !report.unchecked.is_empty() {
         let reasons = report.unchecked.iter().map(|path| format!("{}: {}", code(&path.path), words(&path.reason)));
-        list(&mut body, "Not checked", &reasons.collect::<Vec<_>>());
+        titled(&mut body, "Not checked", &reasons.collect::<Vec<_>>());
     }
     for (at, checkpoint) in format::worst_first(report).into_iter().enumerate() {
         section(&mut body, checkpoint, &section_id(at));
@@ -50,14 +50,9 @@ fn section_id(at: usize) -> String {
 
 /// The table of the models, the worst first as their sections.
 fn models(out: &mut String, overview: &Overview<'_>) {
-    if overview.rows.len() > 1 {
-        out.push_str(
-            "<div class=\"tools\" data-filters=\"models\" hidden><label>Search <input type=\"search\"></label>\
-             <label><input type=\"checkbox\"> with findings only</label><output></output></div>\n",
-        );
-    }
     out.push_str(
-        "<div class=\"tools\"><button type=\"button\" data-fold=\"open\" hidden>Open all</button>\
+        "<div class=\"tools\" data-filters=\"models\" hidden><label>Search <input type=\"search\"></label>\
+         <label><input type=\"checkbox\"> with findings only</label><output></output></div>\n<div class=\"tools\"><button type=\"button\" data-fold=\"open\" hidden>Open all</button>\
          <button type=\"button\" data-fold=\"close\" hidden>Close all</button></div>\n<div class=\"wide\" tabindex=\"0\">\
          <table id=\"models\"><caption>Models, and what versions of transformers do with them</caption>\n<thead><tr><th scope=\"col\">model</th><th scope=\"col\">class</th>\
          <th scope=\"col\" class=\"n\">parameters</th><th scope=\"col\" class=\"n\">size</th>",
@@ -137,7 +132,7 @@ fn section(out: &mut String, checkpoint: &CheckpointReport, id: &str) {
     said.extend(notes(checkpoint));
     said.extend(format::governed(checkpoint));
     said.extend(fixes::section(checkpoint).lines().map(|line| line.trim().to_owned()));
-    list(out, "", &said.iter().map(|line| text(line)).collect::<Vec<_>>());
+    list(out, &said.iter().map(|line| text(line)).collect::<Vec<_>>());
     let (shown, hidden) = capped(&checkpoint.findings, CAP);
     for finding in alike(shown.into_iter().filter(|finding| !finding.is_note()).collect()) {
         finding::render(out, &finding, checkpoint);
@@ -192,7 +187,10 @@ fn lists(out: &mut String, load: &LoadReport, loaders: &[&PredictedLoad]) {
         let mut items: Vec<String> = groups.iter().take(CAP).map(item).collect();
         items.extend(more(groups.len(), CAP));
         items.extend((unlisted > 0).then(|| format!("and {unlisted} tensors that are not listed")));
-        list(out, title, &items);
+        if !items.is_empty() {
+            let _ok = writeln!(out, "<h3>{}</h3>", text(title));
+            list(out, &items);
+        }
     };
     let collapsed = |names: &[String]| collapse(names.iter().map(String::as_str));
     let further = load.unlisted;

@@ -6,7 +6,7 @@ use serde_json::Value;
 
 use super::super::compare::{figures, value};
 use super::super::format::{and, name, plural, shape};
-use super::{Column, code, list, map, page, table, text, words};
+use super::{Column, code, map, page, table, text, titled, words};
 use crate::check::compare::{ChangedCell, ChangesByLayer, ComparedBytes, Differences, OneSided, TensorDifferences};
 use crate::check::inspect::ModuleMap;
 use crate::checkpoint::{DifferenceRank, Distance};
@@ -48,7 +48,7 @@ pub fn render(paths: [&str; 2], differences: &Differences, maps: &[ModuleMap; 2]
     by_layer(&mut body, layers);
     tensors(&mut body, found);
     documents(&mut body, differences);
-    list(&mut body, "Not compared", &differences.unknown.iter().map(|text| words(text)).collect::<Vec<_>>());
+    titled(&mut body, "Not compared", &differences.unknown.iter().map(|text| words(text)).collect::<Vec<_>>());
     page(&and(&paths.map(name)), verdict, &body)
 }
 
@@ -58,7 +58,7 @@ fn by_layer(out: &mut String, found: &ChangesByLayer) {
         return;
     }
     out.push_str(
-        "<h3>Changes by layer</h3>\n<p class=\"dim\">The norm of the difference as a share of the norm before: \
+        "<h2>Changes by layer</h2>\n<p class=\"dim\">The norm of the difference as a share of the norm before: \
          <span class=\"swatch h0\"></span>no other bytes <span class=\"swatch h1\"></span>below 0.0001 \
          <span class=\"swatch h2\"></span>below 0.001 <span class=\"swatch h3\"></span>below 0.01, or not measured \
          <span class=\"swatch h4\"></span>below 0.1 <span class=\"swatch h5\"></span>0.1 and more</p>\n\
@@ -185,7 +185,7 @@ fn documents(out: &mut String, differences: &Differences) {
         let id = |id: Option<u64>| id.map_or_else(|| "none".to_owned(), |id| id.to_string());
         let _ok = writeln!(
             out,
-            "<h3>Tokenizer</h3>\n<p>{} with another id, the first is {}: {} → {}</p>",
+            "<h2>Tokenizer</h2>\n<p>{} with another id, the first is {}: {} → {}</p>",
             plural(tokens.tokens, "token"),
             code(&tokens.first),
             id(tokens.before),
@@ -197,5 +197,5 @@ fn documents(out: &mut String, differences: &Differences) {
         names.iter().map(|file| format!("{what} {}", code(file))).collect()
     };
     let lines = [named("removed", &files.removed), named("added", &files.added), named("changed", &files.changed)];
-    list(out, "Files", &lines.concat());
+    titled(out, "Files", &lines.concat());
 }

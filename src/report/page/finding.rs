@@ -8,7 +8,7 @@ use super::super::edits::splices;
 use super::super::excerpt::{FilePlaces, cut, gather};
 use super::super::format::{advice, details, more, name, tensors};
 use super::super::model::CheckpointReport;
-use super::{code, text, words};
+use super::{code, list, text, words};
 use crate::check::{Finding, FixHint};
 use crate::checkpoint::{line_column, spliced};
 
@@ -33,7 +33,7 @@ pub(super) fn render(out: &mut String, finding: &Finding, checkpoint: &Checkpoin
     );
     notes.extend(details(finding).iter().map(|detail| text(detail)));
     notes.push(format!("rule {}", text(&name(&finding.name))));
-    super::list(out, "", &notes);
+    list(out, &notes);
     if let Some(hint) = &finding.fix {
         fix(out, hint, checkpoint);
     }

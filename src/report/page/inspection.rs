@@ -2,7 +2,7 @@
 
 use super::super::format::{bytes, headline, name, objects, plural};
 use super::super::inspect::count;
-use super::{Column, code, list, map, page, table, text, words};
+use super::{Column, code, map, page, table, text, titled, words};
 use crate::check::inspect::{InspectedFile, Inspection, Memory, ModuleMap};
 use crate::check::verdict::PredictedLoad;
 use crate::checkpoint::files;
@@ -24,12 +24,12 @@ pub fn render(path: &str, inspection: &Inspection, loads: &[PredictedLoad], map:
     );
     if !loads.is_empty() {
         let said: Vec<String> = std::iter::once(headline(loads)).chain(objects(loads)).collect();
-        list(&mut body, "Verdict", &said.iter().map(|line| text(line)).collect::<Vec<_>>());
+        titled(&mut body, "Verdict", &said.iter().map(|line| text(line)).collect::<Vec<_>>());
     }
     map::render(&mut body, "map", "Map", map);
     facts(&mut body, inspection);
     if let Some(memory) = &inspection.memory {
-        table(&mut body, "Memory", &[("", LEFT), ("bytes", RIGHT), ("", LEFT)], &memory_rows(memory));
+        table(&mut body, "Memory", &[("for", LEFT), ("bytes", RIGHT), ("how", LEFT)], &memory_rows(memory));
     }
     let types = inspection.dtypes.iter();
     let rows = types.map(|(dtype, amount)| {
@@ -38,7 +38,7 @@ pub fn render(path: &str, inspection: &Inspection, loads: &[PredictedLoad], map:
     let columns = [("type", LEFT), ("tensors", RIGHT), ("parameters", RIGHT), ("bytes", RIGHT)];
     table(&mut body, "Element types", &columns, &rows.collect::<Vec<_>>());
     files(&mut body, inspection);
-    list(&mut body, "Notes", &inspection.notes.iter().map(|note| words(note)).collect::<Vec<_>>());
+    titled(&mut body, "Notes", &inspection.notes.iter().map(|note| words(note)).collect::<Vec<_>>());
     page(&name(path), &subtitle, &body)
 }
 
@@ -57,7 +57,7 @@ fn facts(out: &mut String, inspection: &Inspection) {
     if let Some(best) = inspection.classes.first() {
         rows.push(vec!["class by tensors".to_owned(), code(&best.class)]);
     }
-    table(out, "Class", &[("", LEFT), ("", LEFT)], &rows);
+    table(out, "Class", &[("property", LEFT), ("value", LEFT)], &rows);
     let votes = inspection.votes.iter().flat_map(|votes| &votes.votes).filter(|vote| vote.outvotes());
     let rows: Vec<Vec<String>> = votes
         .map(|vote| {
@@ -101,7 +101,7 @@ fn files(out: &mut String, inspection: &Inspection) {
         };
         vec![code(&file.name), bytes(file.bytes), file.tensors.map(|n| n.to_string()).unwrap_or_default(), bar]
     };
-    let columns = [("file", LEFT), ("bytes", RIGHT), ("tensors", RIGHT), ("", LEFT)];
+    let columns = [("file", LEFT), ("bytes", RIGHT), ("tensors", RIGHT), ("share of the largest", LEFT)];
     let rows: Vec<Vec<String>> = inspection.files.iter().map(row).collect();
     table(out, "Files", &columns, &rows);
 }

@@ -24,7 +24,7 @@ pub(super) fn render(out: &mut String, id: &str, title: &str, map: &ModuleMap) {
     if total == 0 {
         return;
     }
-    let _ok = writeln!(out, "<h3>{}</h3>\n<div class=\"colours\">", text(title));
+    let _ok = writeln!(out, "<h2>{}</h2>\n<div class=\"colours\">", text(title));
     choice(out, id, &map.properties);
     let colours: Vec<Vec<Colour>> = map.properties.iter().map(colours).collect();
     let painter = Painter { map, colours: &colours, total };

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::super::format::{bytes, changed, name, plural, shape, tokens_used, trained};
 use super::super::model::{CheckpointMap, MergeReport, Seam};
-use super::{Column, block, code, list, map, table, text, words};
+use super::{Column, block, code, list, map, table, text, titled, words};
 
 const LEFT: Column = Column::Left;
 
@@ -34,8 +34,8 @@ pub(super) fn render(out: &mut String, merge: &MergeReport) {
     }
     tensors(out, merge);
     let sentences = |lines: &[String]| lines.iter().map(|line| words(line)).collect::<Vec<_>>();
-    list(out, "Repaired", &sentences(&merge.repairs));
-    list(out, "Notes", &sentences(&merge.notes));
+    titled(out, "Repaired", &sentences(&merge.repairs));
+    titled(out, "Notes", &sentences(&merge.notes));
     if let Some(training) = merge.training.as_ref().filter(|training| training.pattern.is_some()) {
         let rows: Vec<Vec<String>> = trained(training)
             .into_iter()
@@ -51,7 +51,7 @@ pub(super) fn render(out: &mut String, merge: &MergeReport) {
     table(out, "Tokens", &[("token", LEFT), ("id", LEFT), ("used as", LEFT)], &tokens);
     for (title, lines) in [("Load it like this", &merge.usage), ("Ask about a picture", &merge.prompt)] {
         if !lines.is_empty() {
-            let _ok = writeln!(out, "<h3>{title}</h3>");
+            let _ok = writeln!(out, "<h2>{title}</h2>");
             block(out, lines);
         }
     }
@@ -62,7 +62,7 @@ pub(super) fn render(out: &mut String, merge: &MergeReport) {
 /// A seam as a joint: the two tensors that should meet, with their shapes.
 fn render_seam(out: &mut String, seam: &Seam) {
     let _ok =
-        writeln!(out, "<article class=\"error\"><h3><span class=\"error\">seam</span> {}</h3>", words(&seam.message));
+        writeln!(out, "<article class=\"error\"><h2><span class=\"error\">seam</span> {}</h2>", words(&seam.message));
     let mut rows = Vec::new();
     for (what, part, needed) in [("mismatch", &seam.tensor, seam.needed.as_deref()), ("must match", &seam.meets, None)]
     {
@@ -71,9 +71,10 @@ fn render_seam(out: &mut String, seam: &Seam) {
             vec![what.to_owned(), text(&name(&part.donor)), code(&part.name), shape(&part.shape), needed]
         }));
     }
-    let columns = [("", LEFT), ("donor", LEFT), ("tensor", LEFT), ("shape", LEFT), ("needed", LEFT)];
+    let columns = [("part", LEFT), ("donor", LEFT), ("tensor", LEFT), ("shape", LEFT), ("needed", LEFT)];
     table(out, "Tensors that do not fit", &columns, &rows);
-    list(out, "Options", &seam.options.iter().map(|option| words(option)).collect::<Vec<_>>());
+    let options = seam.options.iter().map(|option| format!("<strong>Option:</strong> {}", words(option)));
+    list(out, &options.collect::<Vec<_>>());
     out.push_str("</article>\n");
 }
 
@@ -81,9 +82,9 @@ fn tensors(out: &mut String, merge: &MergeReport) {
     if !merge.transforms.is_empty() {
         let how: Vec<String> = merge.transforms.iter().map(|(how, n)| format!("{n} {}", how.name())).collect();
         let (tensors, size) = (plural(merge.tensors, "tensor"), bytes(merge.bytes));
-        let _ok = writeln!(out, "<h3>Tensors</h3>\n<p>{tensors}, {size}: {}</p>", how.join(", "));
+        let _ok = writeln!(out, "<h2>Tensors</h2>\n<p>{tensors}, {size}: {}</p>", how.join(", "));
     }
-    list(out, "", &merge.casts().iter().map(|line| text(line)).collect::<Vec<_>>());
+    list(out, &merge.casts().iter().map(|line| text(line)).collect::<Vec<_>>());
     let rows: Vec<Vec<String>> =
         changed(merge).map(|[tensor, how, from, to]| vec![code(&tensor), text(&how), text(&from), text(&to)]).collect();
     table(out, "Changed tensors", &[("tensor", LEFT), ("how", LEFT), ("from", LEFT), ("to", LEFT)], &rows);
