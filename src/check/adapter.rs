@@ -9,6 +9,7 @@ mod config;
 mod formats;
 mod keys;
 pub mod lora;
+mod summary;
 mod targets;
 
 use crate::checkpoint::files;
@@ -22,6 +23,7 @@ use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tensor};
 use crate::knowledge::Table;
 use crate::knowledge::peft::PeftKeys;
 use keys::{AdapterKey, MatrixRole};
+pub use summary::{AdaptedModules, AdapterSummary};
 use targets::Targets;
 
 /// The tensors of one module.

@@ -2,6 +2,7 @@
 
 mod map;
 mod memory;
+mod pipeline;
 mod tensors;
 mod tree;
 
@@ -10,6 +11,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::Serialize;
 use serde_json::{Map, Value};
 
+use super::adapter::AdapterSummary;
 use super::load::{self, Stored};
 use super::votes::{self, Fit, Votes, vote};
 use crate::checkpoint::{Checkpoint, Tensor, pointer};
@@ -19,6 +21,7 @@ use crate::knowledge::{Architecture, Library, Loader};
 pub use self::map::{MapProperty, ModuleMap, PropertyKind};
 pub(super) use self::map::{Painted, by_dtype};
 pub use self::memory::{CacheInput, Memory};
+pub use self::pipeline::{InspectedPart, pipeline_parts};
 pub use self::tensors::{InspectedTensor, tensors};
 pub use self::tree::InspectedModule;
 
@@ -26,6 +29,8 @@ pub use self::tree::InspectedModule;
 const CANDIDATES: usize = 8;
 /// Classes with equally good names that are built, to compare their defaults with the tensors.
 const BUILT: usize = 40;
+/// Tensors of a checkpoint for which more than one class is voted on.
+const VOTED_ON: usize = 2_000;
 /// Share of the names that a likely class has.
 const LIKELY: f64 = 0.95;
 /// Model types that are tried for a part.
@@ -43,6 +48,11 @@ pub struct Inspection {
     pub dtypes: BTreeMap<String, Amount>,
     /// The tree of modules, complete; consecutive numbered modules with the same tensors are one.
     pub tree: Vec<InspectedModule>,
+    /// The parts of a pipeline, and other checkpoints in folders; empty where they were not opened.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub parts: Vec<InspectedPart>,
+    /// The adapter; null without an `adapter_config.json`.
+    pub adapter: Option<AdapterSummary>,
     /// The identity that config.json declares; null without a config.json.
     pub config: Option<ConfigSummary>,
     /// Classes that match the tensor names, best first; the class of the config is first if it is known.
@@ -147,6 +157,8 @@ pub fn inspect(checkpoint: &Checkpoint, library: &Library, cache: CacheInput) ->
         tensors,
         dtypes,
         tree: tree::of(checkpoint, &|_, _| ()),
+        parts: Vec::new(),
+        adapter: AdapterSummary::of(checkpoint),
         config: checkpoint.config().map(config_summary),
         classes: Vec::new(),
         votes: None,
@@ -175,6 +187,7 @@ fn judge(inspection: &mut Inspection, config: Option<&Value>, stored: &Stored, l
         alike.sort_by_key(|r| r.architecture.class() != class.class());
     } else {
         nearest_first(&mut alike, stored);
+        fitting_first(&mut alike, stored, library);
     }
     let best = named.or_else(|| alike.first().map(|r| r.architecture));
     let Some(best) = best else {
@@ -259,6 +272,33 @@ fn nearest_first(alike: &mut [Resemblance<'_>], stored: &Stored) {
             fit.expected.saturating_add(fit.stored).saturating_sub(fit.found).saturating_add(fit.mismatched)
         })
     });
+}
+
+/// Of the classes whose names fit equally well, puts the one first whose shapes fit the best once its values are those that the
+/// tensors imply: a model may be far from the defaults of its own class. Many tensors would take long.
+fn fitting_first(alike: &mut [Resemblance<'_>], stored: &Stored, library: &Library) {
+    let Some(best) = alike.first().map(Resemblance::score).filter(|_| stored.names().take(VOTED_ON).count() < VOTED_ON)
+    else {
+        return;
+    };
+    let tied = alike.iter().take(CANDIDATES).take_while(|r| r.score() >= best);
+    let fit = |r: &Resemblance<'_>| {
+        let start = parts(r.architecture.start(), r.architecture, Some(r), stored, library);
+        vote(r.architecture, &start, stored).map_or(0.0, |votes| votes.after.score())
+    };
+    let mut most = (0, 0.0);
+    for (at, r) in tied.enumerate() {
+        let fit = fit(r);
+        if fit > most.1 {
+            most = (at, fit);
+        }
+        if fit >= 1.0 {
+            break;
+        }
+    }
+    if let Some(tied) = alike.get_mut(..=most.0) {
+        tied.rotate_right(1);
+    }
 }
 
 fn candidate(library: &Library, architecture: Architecture<'_>, alike: Option<&Resemblance<'_>>) -> ClassCandidate {

@@ -114,6 +114,17 @@ impl Shard {
         self.pickle().is_none_or(|pickle| !pickle.strided.contains(tensor))
     }
 
+    /// Reads a file of tensors by itself: a safetensors file by the end of its name, or a pickle by its name or its first bytes.
+    /// `None` for a file that is neither. Called by the program for `inspect FILE`.
+    #[must_use]
+    pub fn read_alone(source: &Source, name: &str) -> Option<Self> {
+        if name.ends_with(".safetensors") {
+            return Some(Self::read(source, name));
+        }
+        let is_pickle = is_pickle_name(name) || may_be_pickle(name) && starts_like_pickle(source, name);
+        is_pickle.then(|| Self::read_pickle(source, name, &mut Budget::default()))
+    }
+
     /// Reads the pickle `name`. Never fails: every problem becomes a fault.
     pub(super) fn read_pickle(source: &Source, name: &str, budget: &mut Budget) -> Self {
         match source.open_regular(name, u64::MAX) {

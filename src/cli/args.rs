@@ -145,7 +145,7 @@ pub struct ExpectArgs {
 /// Arguments of `inspect`.
 #[derive(Debug, Args)]
 pub struct InspectArgs {
-    /// A checkpoint directory, with or without a config.json, or a .safetensors file
+    /// A checkpoint directory, with or without a config.json, or a file of tensors (safetensors, or a pickle)
     #[arg(value_name = "PATH", default_value = ".")]
     pub path: PathBuf,
     /// Print the tree of modules to N levels, 0 for all; without it, as many as stay short. JSON has all
@@ -168,7 +168,7 @@ pub struct InspectArgs {
 /// Arguments of `diff`.
 #[derive(Debug, Args)]
 pub struct DiffArgs {
-    /// The first checkpoint: a directory, or a .safetensors file
+    /// The first checkpoint: a directory, or a file of tensors
     #[arg(value_name = "BEFORE")]
     pub before: PathBuf,
     /// The second one

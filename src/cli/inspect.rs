@@ -2,7 +2,7 @@
 
 use crate::checkpoint::files;
 use std::cell::LazyCell;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::{Context, anyhow, bail};
@@ -11,7 +11,7 @@ use super::args::{InspectArgs, InspectFormat};
 use super::exit::CLEAN;
 use super::{library, output, paths};
 use crate::check::check;
-use crate::check::inspect::{CacheInput, InspectedTensor, ModuleMap, inspect, tensors};
+use crate::check::inspect::{CacheInput, InspectedTensor, ModuleMap, inspect, pipeline_parts, tensors};
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, Parts, Shard, find_checkpoints};
 use crate::knowledge::directories::Directories;
@@ -20,7 +20,8 @@ use crate::report::{inspect as report, page};
 /// Runs `inspect`.
 pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let path = &args.path;
-    let checkpoint = Arc::new(open(path)?);
+    let (checkpoint, inside) = opened(path)?;
+    let checkpoint = Arc::new(checkpoint);
     let listed = args.tensors.as_ref().map(|glob| list(&checkpoint, path, glob)).transpose()?;
     let name = shown(path);
     let cache = CacheInput { context: args.context, batch: args.batch };
@@ -29,7 +30,9 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         let has = |name: &str| checkpoint.entries.contains_key(name);
         let is_model = [files::CONFIG, files::INDEX, files::ADAPTER_CONFIG].into_iter().any(has);
         let loads = if is_model { check(&checkpoint, &knowledge).verdicts } else { Vec::new() };
-        anyhow::Ok((inspect(&checkpoint, &knowledge.library, cache), loads))
+        let mut inspection = inspect(&checkpoint, &knowledge.library, cache);
+        inspection.parts = pipeline_parts(&checkpoint, &inside);
+        anyhow::Ok((inspection, loads))
     });
     output::look(&args.output, |format, style| {
         if let (InspectFormat::Full, Some(listed)) = (format, &listed) {
@@ -48,26 +51,33 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
 /// Opens the checkpoint at a path, or in it, or a file of tensors. `inspect` and `diff` call it. Fails where there is none, and
 /// where there are several.
 pub(super) fn open(path: &Path) -> anyhow::Result<Checkpoint> {
+    opened(path).map(|(checkpoint, _)| checkpoint)
+}
+
+/// The same with the checkpoints in its folders, by their relative paths: the parts of a pipeline.
+fn opened(path: &Path) -> anyhow::Result<(Checkpoint, Vec<(String, Checkpoint)>)> {
     if !path.exists() {
         bail!("{}: no such file or directory", path.display());
     }
     if let Some(shard) = alone(path) {
-        return Ok(shard);
+        return Ok((shard, Vec::new()));
     }
     let kinds = Directories::embedded()?;
     let mut found = find_checkpoints(path, &|names| kinds.recognise(names));
-    // Those in the folders of a checkpoint are opened on their own.
+    let mut inside = Vec::new();
     if found.checkpoints.iter().any(|dir| dir == path) {
-        found.checkpoints.retain(|dir| dir == path);
+        inside = found.checkpoints.extract_if(.., |dir| dir != path).collect();
     }
     let [dir] = found.checkpoints.as_slice() else {
         if let Some(reason) = paths::nothing(path, &found) {
             bail!("{}: {reason}", path.display());
         }
         let count = found.checkpoints.len();
-        bail!("{}: contains {count} checkpoints; pass one of them, or a .safetensors file", path.display());
+        bail!("{}: contains {count} checkpoints; pass one of them, or a file of tensors", path.display());
     };
-    Checkpoint::open(dir).with_context(|| dir.display().to_string())
+    let open = |dir: &Path| Checkpoint::open(dir).with_context(|| dir.display().to_string());
+    let within = |part: &PathBuf| anyhow::Ok((shown(part.strip_prefix(path)?), open(part)?));
+    Ok((open(dir)?, inside.iter().map(within).collect::<anyhow::Result<_>>()?))
 }
 
 /// The tensors that match a pattern; fails if there is none, unless the pattern matches all. Names the files of which tensors
@@ -84,16 +94,16 @@ fn list(checkpoint: &Checkpoint, path: &Path, pattern: &str) -> anyhow::Result<V
     Ok(listed)
 }
 
-/// Opens a shard as a checkpoint of its own, if it has no config and no index beside it.
+/// Opens a file of tensors as a checkpoint of its own: a pickle, or a safetensors file that has no config and no index beside it.
 fn alone(path: &Path) -> Option<Checkpoint> {
-    if !path.is_file() || path.extension().is_none_or(|e| e != "safetensors") {
+    if !path.is_file() {
         return None;
     }
     let parent = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
     let name = path.file_name()?.to_str()?;
-    if [files::CONFIG, files::INDEX].iter().any(|beside| parent.join(beside).exists()) {
+    if [files::CONFIG, files::INDEX, files::PICKLE_INDEX].iter().any(|beside| parent.join(beside).exists()) {
         return None;
     }
-    let shards = vec![Shard::read(&parent.into(), name)];
+    let shards = vec![Shard::read_alone(&parent.into(), name)?];
     Some(Checkpoint::planned(parent, Parts { shards, ..Parts::default() }))
 }

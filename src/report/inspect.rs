@@ -15,7 +15,8 @@ use super::json::pretty;
 use super::model::ToolInfo;
 use super::terminal::load::table;
 use super::terminal::paint::Paint;
-use crate::check::inspect::{Amount, ClassCandidate, InspectedTensor, Inspection, Memory};
+use crate::check::adapter::{AdaptedModules, AdapterSummary};
+use crate::check::inspect::{Amount, ClassCandidate, InspectedPart, InspectedTensor, Inspection, Memory};
 use crate::check::verdict::PredictedLoad;
 use crate::check::votes::{Vote, Votes};
 
@@ -90,8 +91,15 @@ pub fn full(
     }
     amounts(&mut out, "dtypes", &inspection.dtypes, style);
     tree::render(&mut out, &inspection.tree, levels, style);
+    parts(&mut out, inspection, style);
     files(&mut out, inspection, style);
-    class(&mut out, inspection, style);
+    if let Some(summary) = &inspection.adapter {
+        adapter(&mut out, summary, style);
+    }
+    // What a pipeline is stands in its parts.
+    if inspection.parts.is_empty() || inspection.tensors.tensors > 0 {
+        class(&mut out, inspection, style);
+    }
     if let Some(found) = &inspection.memory {
         memory(&mut out, found, style);
     }
@@ -137,6 +145,53 @@ fn files(out: &mut String, inspection: &Inspection, style: Style) {
         .collect();
     let _ok = writeln!(out, "\n  files");
     table(out, ["", "bytes", "tensors"], &rows, style);
+}
+
+fn parts(out: &mut String, inspection: &Inspection, style: Style) {
+    let row = |part: &InspectedPart| {
+        let figure = |of: fn(&Amount) -> String| part.amount.as_ref().map(of).unwrap_or_default();
+        let class = part.class.as_deref().map(name).unwrap_or_default();
+        let [parameters, size] = [figure(|a| count(a.parameters)), figure(|a| bytes(a.bytes))];
+        [name(&part.folder), class, figure(|a| a.tensors.to_string()), parameters, size]
+    };
+    let rows: Vec<[String; 5]> = inspection.parts.iter().map(row).collect();
+    if !rows.is_empty() {
+        let _ok = writeln!(out, "\n  parts");
+        table(out, ["", "class", "tensors", "parameters", "bytes"], &rows, style);
+    }
+}
+
+/// What an adapter is, and the modules that it changes.
+fn adapter(out: &mut String, summary: &AdapterSummary, style: Style) {
+    out.push('\n');
+    prose(out, &adapter_line(summary), style);
+    let rows: Vec<[String; 3]> = summary.targets.iter().map(target).collect();
+    if !rows.is_empty() {
+        let _ok = writeln!(out, "\n  targets");
+        table(out, ["", "modules", "rank"], &rows, style);
+    }
+    if summary.others > 0 {
+        prose(out, &format!("{} beside the low-rank matrices", plural(summary.others, "tensor")), style);
+    }
+}
+
+/// `adapter: LORA with r 8 and lora_alpha 16, for meta-llama/Llama-3.1-8B`.
+pub(super) fn adapter_line(summary: &AdapterSummary) -> String {
+    let kind = summary.kind.as_deref().map_or_else(|| "no peft_type".to_owned(), name);
+    let rank = summary.rank.map(|rank| format!("r {rank}"));
+    let alpha = summary.alpha.map(|alpha| format!("lora_alpha {alpha}"));
+    let figures: Vec<String> = rank.into_iter().chain(alpha).collect();
+    let figures = if figures.is_empty() { String::new() } else { format!(" with {}", and(&figures)) };
+    let base = summary.base.as_deref().filter(|base| !base.is_empty());
+    let base = base.map_or_else(|| "a base model that it does not name".to_owned(), name);
+    format!("adapter: {kind}{figures}, for {base}")
+}
+
+/// Name, number of modules and ranks of the targets of one name.
+pub(super) fn target(target: &AdaptedModules) -> [String; 3] {
+    let ranks: Vec<String> = target.ranks.iter().take(8).map(u64::to_string).collect();
+    let further = more(target.ranks.len(), 8).map(|more| format!(" {more}")).unwrap_or_default();
+    [name(&target.name), target.modules.to_string(), ranks.join(", ") + &further]
 }
 
 fn memory(out: &mut String, found: &Memory, style: Style) {

@@ -6,6 +6,8 @@ mod check;
 mod diff;
 mod expect;
 #[cfg(unix)]
+mod inspect;
+#[cfg(unix)]
 mod pins;
 #[cfg(unix)]
 mod selection;

@@ -1,9 +1,11 @@
 //! The page of an inspection.
 
+use std::fmt::Write as _;
+
 use super::super::format::{bytes, headline, name, objects, plural};
-use super::super::inspect::count;
+use super::super::inspect::{adapter_line, count, target};
 use super::{Column, code, map, page, table, text, titled, words};
-use crate::check::inspect::{InspectedFile, Inspection, Memory, ModuleMap};
+use crate::check::inspect::{Amount, InspectedFile, InspectedPart, Inspection, Memory, ModuleMap};
 use crate::check::verdict::PredictedLoad;
 use crate::checkpoint::files;
 
@@ -28,6 +30,13 @@ pub fn render(path: &str, inspection: &Inspection, loads: &[PredictedLoad], map:
     }
     map::render(&mut body, "map", "Map", map);
     facts(&mut body, inspection);
+    if let Some(summary) = &inspection.adapter {
+        let _ok = writeln!(body, "<h2>Adapter</h2>\n<p>{}</p>", words(&adapter_line(summary)));
+        let rows: Vec<Vec<String>> =
+            summary.targets.iter().map(|one| target(one).map(|cell| text(&cell)).to_vec()).collect();
+        table(&mut body, "Targets", &[("module", LEFT), ("modules", RIGHT), ("rank", RIGHT)], &rows);
+    }
+    parts(&mut body, inspection);
     if let Some(memory) = &inspection.memory {
         table(&mut body, "Memory", &[("for", LEFT), ("bytes", RIGHT), ("how", LEFT)], &memory_rows(memory));
     }
@@ -40,6 +49,17 @@ pub fn render(path: &str, inspection: &Inspection, loads: &[PredictedLoad], map:
     files(&mut body, inspection);
     titled(&mut body, "Notes", &inspection.notes.iter().map(|note| words(note)).collect::<Vec<_>>());
     page(&name(path), &subtitle, &body)
+}
+
+fn parts(out: &mut String, inspection: &Inspection) {
+    let row = |part: &InspectedPart| {
+        let figure = |of: fn(&Amount) -> String| part.amount.as_ref().map(of).unwrap_or_default();
+        let class = part.class.as_deref().map(code).unwrap_or_default();
+        let [parameters, size] = [figure(|a| count(a.parameters)), figure(|a| bytes(a.bytes))];
+        vec![code(&part.folder), class, figure(|a| a.tensors.to_string()), parameters, size]
+    };
+    let columns = [("part", LEFT), ("class", LEFT), ("tensors", RIGHT), ("parameters", RIGHT), ("bytes", RIGHT)];
+    table(out, "Parts", &columns, &inspection.parts.iter().map(row).collect::<Vec<_>>());
 }
 
 /// What config.json says, and what the tensors say.
