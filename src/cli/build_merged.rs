@@ -38,6 +38,7 @@ pub fn run(args: &BuildMergedArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         output::write(file, &json::pretty(plan)).with_context(|| format!("writing {}", file.display()))?;
     }
     let report = if args.how.report.has(Format::Html) { run.report_with_maps() } else { run.report() };
+    let report = report.with_terms(&knowledge, (!args.how.report.exit_zero).then_some(least(args)));
     output::finish(&report, &args.how.report, false, false).with_context(|| match stage {
         Some(MergeStage::Written) => format!("{} is written, but the report could not be", run.record.out),
         _ => "the report could not be written".to_owned(),
@@ -73,8 +74,13 @@ Other options
     ))
 }
 
+/// The lowest severity of a finding of the result that fails the run.
+fn least(args: &BuildMergedArgs) -> Severity {
+    args.how.report.fail_on.map_or(Severity::Error, SeverityName::severity)
+}
+
 fn result_fails(run: &MergeRun, args: &BuildMergedArgs) -> bool {
-    let least = args.how.report.fail_on.map_or(Severity::Error, SeverityName::severity);
+    let least = least(args);
     let result = run.checked.iter().rfind(|c| !matches!(c.role, Role::Donor(_)));
     result.is_some_and(|c| c.outcome.findings.iter().any(|f| f.severity >= least))
 }

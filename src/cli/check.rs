@@ -137,7 +137,9 @@ impl CheckRun<'_> {
         let failed = reports.iter().any(|report| report.counts.worst().is_some_and(|w| w >= by.fail_on));
         let code = results.exit(fixed || failed && !args.report.exit_zero);
         let hidden = reports.iter_mut().map(|report| report.hide_below(by.min_severity)).sum();
+        let fail_on = (!args.report.exit_zero).then_some(by.fail_on);
         let report = Report::new(reports, None).with_unchecked(results.unchecked).with_hidden(hidden);
+        let report = report.with_terms(&by.knowledge, fail_on);
         output::finish(&report, &args.report, args.statistics, args.quiet)?;
         if args.verbose {
             for (dir, skipped) in &skips {

@@ -14,7 +14,7 @@ use std::sync::Arc;
 use sha2::{Digest as _, Sha256};
 
 use super::format::{advice, governed, headline, sentence};
-use super::model::{CheckpointReport, MergeReport, Report, UncheckedPath};
+use super::model::{CheckpointReport, MergeReport, MergeStage, Report, Role, UncheckedPath};
 use crate::check::finding::Accepted;
 use crate::check::{Finding, FixHint, Location, Severity};
 use crate::checkpoint::hex;
@@ -58,6 +58,8 @@ pub struct Item<'a> {
     pub message: String,
     /// Places; may be empty.
     pub locations: &'a [Location],
+    /// Whether it makes the run fail.
+    pub fails: bool,
     /// The fix, if any.
     pub fix: Option<&'a FixHint>,
     /// The next step, escaped for display.
@@ -69,13 +71,29 @@ pub struct Item<'a> {
 /// All items of a report: one group for each checkpoint, for a merge, and for each path that could not be checked.
 pub fn groups(report: &Report) -> Vec<Group<'_>> {
     let mut seen = BTreeMap::new();
-    let mut groups: Vec<Group<'_>> = report.checkpoints.iter().map(|c| findings(c, &mut seen)).collect();
+    // Once a merge has a result, or a plan that was asked for, its donors do not matter.
+    let has_result = report
+        .merge
+        .as_ref()
+        .is_some_and(|merge| matches!(merge.stage, Some(MergeStage::Written | MergeStage::DryRun)));
+    let fails = |c: &CheckpointReport, severity: Severity| {
+        let counts = !has_result || !matches!(c.role, Some(Role::Donor(_)));
+        counts && report.terms.fail_on.is_some_and(|least| severity >= least)
+    };
+    let mut groups: Vec<Group<'_>> = Vec::new();
+    for checkpoint in &report.checkpoints {
+        groups.push(findings(checkpoint, &|severity| fails(checkpoint, severity), &mut seen));
+    }
     groups.extend(report.merge.as_ref().map(|m| seams(m, &mut seen)));
     groups.extend(report.unchecked.iter().map(|u| unchecked(u, &mut seen)));
     groups
 }
 
-fn findings<'a>(checkpoint: &'a CheckpointReport, seen: &mut BTreeMap<String, usize>) -> Group<'a> {
+fn findings<'a>(
+    checkpoint: &'a CheckpointReport,
+    fails: &dyn Fn(Severity) -> bool,
+    seen: &mut BTreeMap<String, usize>,
+) -> Group<'a> {
     let path = tidy(&checkpoint.path);
     let role = checkpoint.role.as_ref().map(ToString::to_string).unwrap_or_default();
     let title = if role.is_empty() { path.clone() } else { format!("{path} ({role})") };
@@ -85,6 +103,7 @@ fn findings<'a>(checkpoint: &'a CheckpointReport, seen: &mut BTreeMap<String, us
         severity: finding.severity,
         message: sentence(&finding.message),
         locations: &finding.locations,
+        fails: fails(finding.severity),
         fix: finding.fix.as_ref(),
         help: finding.fix.as_ref().map(|hint| advice(hint).join("; ")),
         fingerprint: of_finding(finding, &path, &role, seen),
@@ -121,6 +140,7 @@ fn seams<'a>(merge: &'a MergeReport, seen: &mut BTreeMap<String, usize>) -> Grou
         severity: Severity::Error,
         message: sentence(&seam.message),
         locations: &[],
+        fails: true,
         fix: None,
         help: (!seam.options.is_empty()).then(|| sentence(&format!("Try {}", seam.options.join(" or ")))),
         fingerprint: fingerprint(&[&path, SEAM, &merge.recipe, &seam.message], seen),
@@ -145,6 +165,7 @@ fn unchecked<'a>(unchecked: &UncheckedPath, seen: &mut BTreeMap<String, usize>) 
         severity: Severity::Error,
         message: sentence(&unchecked.reason),
         locations: &[],
+        fails: true,
         fix: None,
         help: None,
         fingerprint: fingerprint(&[&path, UNCHECKED], seen),

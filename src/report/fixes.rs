@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::format::{name, plural, sentence};
+use super::format::{fixed, name, plural};
 use super::model::{CheckpointReport, Fixing, Report};
 use crate::check::{Finding, Safety};
 
@@ -15,31 +15,7 @@ pub(super) fn mark(finding: &Finding, fixing: Option<Fixing>) -> &'static str {
 
 /// The fixes applied to a checkpoint, and those that were rolled back.
 pub(super) fn section(checkpoint: &CheckpointReport) -> String {
-    let mut out = String::new();
-    for (many, (code, file, title)) in
-        together(checkpoint.fixed.iter().map(|f| (&*f.code, f.file.as_deref(), &*f.title)))
-    {
-        let file = file.map(|file| format!(" in {}", name(file))).unwrap_or_default();
-        let _ok = writeln!(out, "  fixed {}{file}: {}{many}", name(code), sentence(title));
-    }
-    for one in &checkpoint.withdrawn {
-        let (code, title, reason) = (name(&one.code), sentence(&one.title), sentence(&one.reason));
-        let _ok = writeln!(out, "  not fixed {code}: {title}; {reason}");
-    }
-    out
-}
-
-/// Groups equal lines, with the size of each group.
-fn together<T: PartialEq>(lines: impl Iterator<Item = T>) -> Vec<(String, T)> {
-    let mut counted: Vec<(usize, T)> = Vec::new();
-    for line in lines {
-        match counted.iter_mut().find(|(_, other)| *other == line) {
-            Some((count, _)) => *count = count.saturating_add(1),
-            None => counted.push((1, line)),
-        }
-    }
-    let many = |n: usize| if n > 1 { format!(" ({n} times)") } else { String::new() };
-    counted.into_iter().map(|(n, line)| (many(n), line)).collect()
+    fixed(checkpoint).iter().fold(String::new(), |out, line| out + "  " + line + "\n")
 }
 
 /// The number of fixes that were applied or can be applied; `None` without fixes.

@@ -283,6 +283,33 @@ pub fn alike(findings: Vec<&Finding>) -> Vec<Finding> {
     together
 }
 
+/// The fixes applied to a checkpoint, and those that were rolled back, one line each.
+pub fn fixed(checkpoint: &CheckpointReport) -> Vec<String> {
+    let made = together(checkpoint.fixed.iter().map(|f| (&*f.code, f.file.as_deref(), &*f.title)));
+    let made = made.into_iter().map(|(many, (code, file, title))| {
+        let file = file.map(|file| format!(" in {}", name(file))).unwrap_or_default();
+        format!("fixed {}{file}: {}{many}", name(code), sentence(title))
+    });
+    let withdrawn = checkpoint
+        .withdrawn
+        .iter()
+        .map(|one| format!("not fixed {}: {}; {}", name(&one.code), sentence(&one.title), sentence(&one.reason)));
+    made.chain(withdrawn).collect()
+}
+
+/// Groups equal lines, with the size of each group.
+fn together<T: PartialEq>(lines: impl Iterator<Item = T>) -> Vec<(String, T)> {
+    let mut counted: Vec<(usize, T)> = Vec::new();
+    for line in lines {
+        match counted.iter_mut().find(|(_, other)| *other == line) {
+            Some((count, _)) => *count = count.saturating_add(1),
+            None => counted.push((1, line)),
+        }
+    }
+    let many = |n: usize| if n > 1 { format!(" ({n} times)") } else { String::new() };
+    counted.into_iter().map(|(n, line)| (many(n), line)).collect()
+}
+
 /// The checkpoints in the order of the formats for people: the worst first, by severity, verdict and number of findings. The
 /// checkpoints of a merge stay in the order of its stages.
 pub fn worst_first(report: &Report) -> Vec<&CheckpointReport> {

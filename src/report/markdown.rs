@@ -75,6 +75,7 @@ fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
     let _ok = writeln!(out, "\n{architecture}, {}, {}", plural(checkpoint.tensors, "tensor"), bytes(checkpoint.bytes));
     let mut objects = format::objects(&checkpoint.loads);
     objects.extend(format::notes(checkpoint));
+    objects.extend(format::fixed(checkpoint));
     if !objects.is_empty() {
         out.push('\n');
     }

@@ -1,6 +1,6 @@
 //! The report: the JSON contract, and what every other renderer starts from.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
@@ -39,6 +39,33 @@ pub struct Report {
     /// Maps for a page; empty unless one was asked for.
     #[serde(skip)]
     pub(crate) maps: Vec<CheckpointMap>,
+    /// What the formats for other programs say of the run and its rules.
+    #[serde(skip)]
+    pub(crate) terms: ReportTerms,
+}
+
+/// What a finding means for the run, and what its rule says.
+#[derive(Debug, Clone)]
+pub(crate) struct ReportTerms {
+    /// Lowest severity that fails the run; `None` with `--exit-zero`.
+    pub(crate) fail_on: Option<Severity>,
+    /// Texts of the rules with findings, by code.
+    pub(crate) rules: BTreeMap<String, RuleText>,
+}
+
+impl Default for ReportTerms {
+    fn default() -> Self {
+        Self { fail_on: Some(Severity::Error), rules: BTreeMap::new() }
+    }
+}
+
+/// What a rule says of itself.
+#[derive(Debug, Clone)]
+pub(crate) struct RuleText {
+    /// What it finds, in one sentence.
+    pub(crate) summary: String,
+    /// Why it matters.
+    pub(crate) why: String,
 }
 
 /// The map of a checkpoint of the run.
@@ -59,8 +86,17 @@ impl Report {
         let verdict = if seams { Verdict::Error } else { counts.verdict() };
         let suppressed = checkpoints.iter().map(|c| c.suppressed.len()).sum();
         let summary = Summary { checkpoints: checkpoints.len(), verdict, counts, suppressed, unchecked: 0, hidden: 0 };
-        Self { schema: 3, tool: ToolInfo::this(), checkpoints, merge, unchecked: Vec::new(), summary, maps: Vec::new() }
-            .graded()
+        Self {
+            schema: 3,
+            tool: ToolInfo::this(),
+            checkpoints,
+            merge,
+            unchecked: Vec::new(),
+            summary,
+            maps: Vec::new(),
+            terms: ReportTerms::default(),
+        }
+        .graded()
     }
 
     /// Adds the paths that could not be checked; without findings of severity error, they determine the verdict.
@@ -70,6 +106,24 @@ impl Report {
         self.summary.unchecked = unchecked.len();
         self.unchecked = unchecked;
         self.graded()
+    }
+
+    /// Adds what formats for other programs say of the run: the lowest severity that fails it, `None` for none, and the texts of
+    /// its rules. Called by the program before it renders.
+    #[cfg(feature = "cli")]
+    #[must_use]
+    pub(crate) fn with_terms(mut self, knowledge: &Knowledge, fail_on: Option<Severity>) -> Self {
+        let accepted = |c: &CheckpointReport| c.suppressed.iter().map(|s| s.finding.code.clone()).collect::<Vec<_>>();
+        let of =
+            |c: &CheckpointReport| c.findings.iter().map(|f| f.code.clone()).chain(accepted(c)).collect::<Vec<_>>();
+        let codes: BTreeSet<String> = self.checkpoints.iter().flat_map(of).collect();
+        let rules = knowledge.rules.rules.iter().filter(|rule| codes.contains(&rule.code));
+        let texts = rules.map(|rule| {
+            let text = RuleText { summary: rule.summary.clone(), why: rule.why.clone() };
+            (rule.code.clone(), text)
+        });
+        self.terms = ReportTerms { fail_on, rules: texts.collect() };
+        self
     }
 
     /// Sets the number of findings that `--min-severity` removed from `findings`.

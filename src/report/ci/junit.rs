@@ -8,7 +8,6 @@ use std::fmt::Write as _;
 use quick_junit::{NonSuccessKind, Property, TestCase, TestCaseStatus, TestSuite};
 
 use super::{Group, Item, PATH, UNCHECKED, file, groups, spot};
-use crate::check::Severity;
 use crate::checkpoint::escape;
 use crate::report::Report;
 use crate::report::format::{more, name, tensors};
@@ -46,10 +45,11 @@ pub fn render(report: &Report) -> String {
 }
 
 fn case(group: &Group<'_>, item: &Item<'_>) -> TestCase {
-    let mut status = match item.severity {
+    // A suite fails exactly where the exit code does.
+    let mut status = match item.fails {
         _ if item.code == UNCHECKED => TestCaseStatus::non_success(NonSuccessKind::Error),
-        Severity::Error | Severity::Warning => TestCaseStatus::non_success(NonSuccessKind::Failure),
-        Severity::Info => TestCaseStatus::skipped(),
+        true => TestCaseStatus::non_success(NonSuccessKind::Failure),
+        false => TestCaseStatus::skipped(),
     };
     status
         .set_type(item.severity.name())

@@ -12,7 +12,9 @@ use serde::Serialize;
 use super::{Group, Item, SEAM, UNCHECKED, file, groups};
 use crate::check::finding::Accepted;
 use crate::check::{Location, Severity};
+use crate::checkpoint::line_column;
 use crate::report::format::{name, sentence};
+use crate::report::model::RuleText;
 use crate::report::{Report, json};
 use parts::{ArtifactLocation, ROOT, SarifText, artifact_at, text};
 
@@ -58,6 +60,8 @@ struct SarifRule {
     id: String,
     name: String,
     short_description: SarifText,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    full_description: Option<SarifText>,
     help: SarifText,
 }
 
@@ -111,6 +115,11 @@ struct Region {
     start_line: usize,
     #[serde(skip_serializing_if = "Option::is_none")]
     start_column: Option<usize>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    end_line: Option<usize>,
+    /// The column behind the last character.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    end_column: Option<usize>,
 }
 
 #[derive(Serialize)]
@@ -134,7 +143,7 @@ pub fn render(report: &Report) -> String {
         for (item, accepted) in group.items.iter().map(|item| (item, None)).chain(accepted) {
             let id = name(item.code);
             let rule_index = *known.entry(id.clone()).or_insert_with(|| {
-                rules.push(rule(id.clone(), item));
+                rules.push(rule(id.clone(), item, report.terms.rules.get(item.code)));
                 rules.len().saturating_sub(1)
             });
             let partial_fingerprints = BTreeMap::from([("checkpointFinding/v1", item.fingerprint.clone())]);
@@ -142,7 +151,7 @@ pub fn render(report: &Report) -> String {
                 rule_id: id,
                 rule_index,
                 level: level(item.severity),
-                message: text(&item.message),
+                message: message(item),
                 locations: locations(&group, item),
                 partial_fingerprints,
                 suppressions: accepted.map(suppression).into_iter().collect(),
@@ -177,17 +186,25 @@ const fn level(severity: Severity) -> &'static str {
     }
 }
 
-fn rule(id: String, item: &Item<'_>) -> SarifRule {
-    let why = if [SEAM, UNCHECKED].contains(&item.code) {
+/// What was found, and the next step.
+fn message(item: &Item<'_>) -> SarifText {
+    let step = item.help.iter().map(|help| format!("\n\nHelp: {help}"));
+    text(&std::iter::once(item.message.clone()).chain(step).collect::<String>())
+}
+
+/// A rule in its own words; in those of its name where the report has no others.
+fn rule(id: String, item: &Item<'_>, own: Option<&RuleText>) -> SarifRule {
+    let more = if [SEAM, UNCHECKED].contains(&item.code) {
         String::new()
     } else {
         format!("`ckpt-doctor explain {id}` explains its meaning and the next step.")
     };
-    let step = item.help.iter().map(|step| format!("{step}. "));
-    let help = step.chain([why]).collect::<String>().trim_end().to_owned();
-    let stated = sentence(&item.name.replace('-', " "));
+    let stated = own.map_or_else(|| sentence(&item.name.replace('-', " ")), |own| sentence(&own.summary));
+    let why = own.map(|own| sentence(&own.why));
+    let help = why.iter().cloned().chain([more]).filter(|part| !part.is_empty()).collect::<Vec<_>>().join("\n\n");
     let help = if help.is_empty() { stated.clone() } else { help };
-    SarifRule { id, name: name(item.name), short_description: text(&stated), help: text(&help) }
+    let full_description = why.as_deref().map(text);
+    SarifRule { id, name: name(item.name), short_description: text(&stated), full_description, help: text(&help) }
 }
 
 /// The places of a finding, with tensors grouped by file position; the checkpoint if the finding has no place.
@@ -214,9 +231,12 @@ fn locations(group: &Group<'_>, item: &Item<'_>) -> Vec<SarifLocation> {
 
 fn physical(group: &Group<'_>, location: &Location) -> PhysicalLocation {
     let found = file(&group.path, location);
-    let region = location
-        .line
-        .filter(|_| found.is_some())
-        .map(|start_line| Region { start_line, start_column: location.column });
+    let region = location.line.filter(|_| found.is_some()).map(|start_line| {
+        let source = || group.sources?.get(location.file.as_deref()?);
+        let end = location.span.as_ref().filter(|_| location.column.is_some()).map(|span| span.end);
+        let end = end.zip(source()).map(|(end, source)| line_column(source, end));
+        let (end_line, end_column) = end.unzip();
+        Region { start_line, start_column: location.column, end_line, end_column }
+    });
     PhysicalLocation { artifact_location: artifact_at(found.as_deref().unwrap_or(&group.path)), region }
 }

@@ -3,7 +3,6 @@
 use std::fmt::Write as _;
 
 use super::super::collapse::{NameGroup, collapse};
-use super::super::fixes;
 use super::super::format::{
     self, agreeing, alike, bytes, capped, headline, more, name, notes, objects, plural, summary,
 };
@@ -131,7 +130,7 @@ fn section(out: &mut String, checkpoint: &CheckpointReport, id: &str) {
     let mut said = objects(&checkpoint.loads);
     said.extend(notes(checkpoint));
     said.extend(format::governed(checkpoint));
-    said.extend(fixes::section(checkpoint).lines().map(|line| line.trim().to_owned()));
+    said.extend(format::fixed(checkpoint));
     list(out, &said.iter().map(|line| text(line)).collect::<Vec<_>>());
     let (shown, hidden) = capped(&checkpoint.findings, CAP);
     for finding in alike(shown.into_iter().filter(|finding| !finding.is_note()).collect()) {

@@ -531,3 +531,27 @@ fn a_shard_that_is_cut_off_during_the_read_is_a_finding() {
     });
     assert_eq!(reason.as_deref(), Some("model.safetensors could not be read: it became shorter while it was read"));
 }
+
+/// Continuous integration reads one or the other.
+#[test]
+fn a_junit_report_fails_exactly_when_the_exit_code_does() {
+    let room = TempDir::new().unwrap();
+    let warning = r#"[{ set: { file: "generation_config.json", at: "/temperature", to: 0.7 } }]"#;
+    let error = r#"[{ remove: "tokenizer.json" }, { write: { file: "config.json", bytes: "{" } }]"#;
+    for (name, changes) in [("clean", "[]"), ("warning", warning), ("error", error)] {
+        fs::rename(crate::support::made("llama", changes, room.path()), room.path().join(name)).unwrap();
+    }
+    let mut codes = Vec::new();
+    for name in ["clean", "warning", "error", "missing"] {
+        for options in [&[][..], &["--fail-on", "warning"], &["--fail-on", "info"], &["--exit-zero"]] {
+            let path = room.path().join(name);
+            let args = [&["check", path.to_str().unwrap(), "--output-format", "junit"], options].concat();
+            let run = doctor(&args);
+            let text = String::from_utf8(run.stdout).unwrap();
+            let fails = text.contains("<failure") || text.contains("<error");
+            assert_eq!(fails, run.status.code() != Some(0), "{name} {options:?}: {text}");
+            codes.push(run.status.code().unwrap());
+        }
+    }
+    assert_eq!(codes, [0, 0, 0, 0, 0, 1, 1, 0, 1, 1, 1, 0, 2, 2, 2, 2]);
+}

@@ -51,7 +51,9 @@ fn a_pickle_is_a_file_of_tensors() {
     snapshot!("inspect-pickle", shown(room.path(), &["weights.pt"]));
     // Named by its first bytes alone.
     fs::write(room.path().join("projector.bin"), state.zip()).unwrap();
-    assert!(shown(room.path(), &["projector.bin"]).starts_with("projector.bin: 1 file, 3 tensors, 18 parameters, 72 B\n"));
+    assert!(
+        shown(room.path(), &["projector.bin"]).starts_with("projector.bin: 1 file, 3 tensors, 18 parameters, 72 B\n")
+    );
     fs::write(room.path().join("notes.bin"), "text").unwrap();
     let error = shown(room.path(), &["notes.bin"]);
     assert!(error.starts_with("error: notes.bin: "), "{error}");
