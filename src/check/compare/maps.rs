@@ -1,8 +1,8 @@
 //! What changed where: maps of both checkpoints, and the changes by layer.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-use super::{Differences, TensorDifferences};
+use super::{ComparedBytes, Differences, TensorDifferences};
 use crate::check::inspect::{MapProperty, ModuleMap, Painted, PropertyKind, by_dtype};
 use crate::checkpoint::{Checkpoint, Distance, Shard, Tensor};
 
@@ -16,9 +16,8 @@ const COLUMNS: usize = 200;
 #[must_use]
 pub fn maps(one: &Checkpoint, other: &Checkpoint, differences: &Differences) -> [ModuleMap; 2] {
     let found = &differences.tensors;
-    let kept = if found.equal == unlisted(one, found) { "equal" } else { "equal or not compared" };
     let lists: [(&str, Vec<&str>); 5] = [
-        (kept, Vec::new()),
+        (kept(one, found), Vec::new()),
         ("changed", found.changed.iter().map(|one| one.name.as_str()).collect()),
         ("recast", found.recast.iter().map(|one| one.name.as_str()).collect()),
         ("reshaped", found.reshaped.iter().map(|one| one.name.as_str()).collect()),
@@ -31,11 +30,16 @@ pub fn maps(one: &Checkpoint, other: &Checkpoint, differences: &Differences) -> 
     [map(one, &lists), map(other, &added)]
 }
 
-/// Tensors of the first checkpoint that no list of differences names.
-fn unlisted(one: &Checkpoint, found: &TensorDifferences) -> usize {
-    let all: std::collections::BTreeSet<&str> = one.tensors().map(|(_, tensor)| tensor.name.as_str()).collect();
+/// What is known of the tensors of the first checkpoint that no list of differences names.
+fn kept(one: &Checkpoint, found: &TensorDifferences) -> &'static str {
+    let all: BTreeSet<&str> = one.tensors().map(|(_, tensor)| tensor.name.as_str()).collect();
     let named = [found.changed.len(), found.recast.len(), found.reshaped.len(), found.removed.len()];
-    all.len().saturating_sub(named.into_iter().fold(0, usize::saturating_add))
+    let others = all.len().saturating_sub(named.into_iter().fold(0, usize::saturating_add));
+    match found.bytes {
+        _ if found.equal != others => "equal or not compared",
+        ComparedBytes::Sampled => "no difference found",
+        ComparedBytes::All | ComparedBytes::Measured | ComparedBytes::Ranked => "equal",
+    }
 }
 
 /// By lists of names; the first list has those that no other one names.
@@ -56,6 +60,8 @@ pub struct ChangesByLayer {
     pub rows: Vec<ChangedKind>,
     /// Kinds that changed and are not among the rows.
     pub further: usize,
+    /// What is known of a tensor that is not among the changed ones: `equal`.
+    pub kept: &'static str,
 }
 
 /// Tensors whose names differ only in numbers.
@@ -93,7 +99,9 @@ pub fn changes_by_layer(one: &Checkpoint, found: &TensorDifferences) -> ChangesB
     let recast = found.recast.iter().map(|one| (one.name.as_str(), one.by));
     let changes: HashMap<&str, Option<Distance>> = changed.chain(recast).collect();
     let mut kinds: BTreeMap<String, BTreeMap<u64, ChangedCell>> = BTreeMap::new();
-    for (_, tensor) in one.tensors() {
+    let removed = found.removed.iter().map(|one| one.name.as_str());
+    let elsewhere: BTreeSet<&str> = removed.chain(found.reshaped.iter().map(|one| one.name.as_str())).collect();
+    for (_, tensor) in one.tensors().filter(|(_, tensor)| !elsewhere.contains(tensor.name.as_str())) {
         let Some((pattern, layer)) = kind(&tensor.name) else { continue };
         let cell = kinds.entry(pattern).or_default().entry(layer).or_default();
         cell.tensors = cell.tensors.saturating_add(1);
@@ -114,7 +122,7 @@ pub fn changes_by_layer(one: &Checkpoint, found: &TensorDifferences) -> ChangesB
     let further = rows.len().saturating_sub(ROWS);
     rows.sort_by(|a, b| b.most().total_cmp(&a.most()));
     rows.truncate(ROWS);
-    ChangesByLayer { layers, rows, further }
+    ChangesByLayer { layers, rows, further, kept: kept(one, found) }
 }
 
 impl ChangedKind {

@@ -6,6 +6,9 @@ use super::tree::{self, InspectedModule};
 use crate::check::verdict::PredictedLoad;
 use crate::checkpoint::{Checkpoint, Shard, Tensor};
 
+/// Files that are told apart on a map.
+const FILES: usize = 48;
+
 /// The modules of a checkpoint with the properties that pages show as colours.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct ModuleMap {
@@ -122,11 +125,17 @@ pub(crate) fn by_dtype(checkpoint: &Checkpoint) -> Painted<'_> {
     Painted { property: MapProperty { kind: PropertyKind::Dtype, values }, value: Box::new(value) }
 }
 
+/// Files, of which those behind [`FILES`] are one value: every module has a number for each.
 fn by_file(checkpoint: &Checkpoint) -> Painted<'_> {
-    let values: Vec<String> = checkpoint.shards.keys().cloned().collect();
-    let places: HashMap<&str, usize> =
-        checkpoint.shards.keys().enumerate().map(|(at, name)| (name.as_str(), at)).collect();
-    let value = move |shard: &Shard, _: &Tensor| places.get(shard.name.as_str()).copied().unwrap_or_default();
+    let names = checkpoint.shards.keys();
+    let mut values: Vec<String> = names.clone().take(FILES).cloned().collect();
+    let further = names.len().saturating_sub(values.len());
+    if further > 0 {
+        values.push(format!("{further} more files"));
+    }
+    let last = values.len().saturating_sub(1);
+    let places: HashMap<&str, usize> = names.take(FILES).enumerate().map(|(at, name)| (name.as_str(), at)).collect();
+    let value = move |shard: &Shard, _: &Tensor| places.get(shard.name.as_str()).copied().unwrap_or(last);
     Painted { property: MapProperty { kind: PropertyKind::File, values }, value: Box::new(value) }
 }
 

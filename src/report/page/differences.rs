@@ -57,12 +57,14 @@ fn by_layer(out: &mut String, found: &ChangesByLayer) {
     if found.rows.is_empty() {
         return;
     }
-    out.push_str(
+    let _ok = write!(
+        out,
         "<h2>Changes by layer</h2>\n<p class=\"dim\">The norm of the difference as a share of the norm before: \
-         <span class=\"swatch h0\"></span>no other bytes <span class=\"swatch h1\"></span>below 0.0001 \
+         <span class=\"swatch h0\"></span>{} <span class=\"swatch h1\"></span>below 0.0001 \
          <span class=\"swatch h2\"></span>below 0.001 <span class=\"swatch h3\"></span>below 0.01, or not measured \
          <span class=\"swatch h4\"></span>below 0.1 <span class=\"swatch h5\"></span>0.1 and more</p>\n\
          <div class=\"wide\" tabindex=\"0\"><table class=\"grid\"><thead><tr><th scope=\"col\">tensor</th>",
+        found.kept
     );
     for layer in &found.layers {
         let _ok = write!(out, "<th scope=\"col\">{layer}</th>");
@@ -75,7 +77,7 @@ fn by_layer(out: &mut String, found: &ChangesByLayer) {
                 out.push_str("<td></td>");
                 continue;
             };
-            let (heat, said) = heat(*cell);
+            let (heat, said) = heat(*cell, found.kept);
             let _ok =
                 write!(out, "<td class=\"cell h{heat}\" title=\"layer {layer}: {said}\"><span>{said}</span></td>");
         }
@@ -88,10 +90,10 @@ fn by_layer(out: &mut String, found: &ChangesByLayer) {
 }
 
 /// The colour of a cell, and what it says.
-fn heat(cell: ChangedCell) -> (usize, String) {
+fn heat(cell: ChangedCell, kept: &str) -> (usize, String) {
     const STEPS: [f64; 4] = [0.0001, 0.001, 0.01, 0.1];
     if cell.changed == 0 {
-        return (0, "no other bytes".to_owned());
+        return (0, kept.to_owned());
     }
     let of = if cell.tensors > 1 { format!("{} of {} tensors, ", cell.changed, cell.tensors) } else { String::new() };
     match cell.by.and_then(Distance::relative) {

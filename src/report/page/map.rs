@@ -156,7 +156,7 @@ fn known(value: &str) -> Option<&'static str> {
         "F64" => "#f4a261",
         "I8" | "U8" => "#cdb4db",
         "I32" | "U32" | "I64" | "U64" | "I16" | "U16" => "#d8c3a5",
-        "not in a list" | "equal" | "equal or not compared" | "in both" => "#cfe8cf",
+        "not in a list" | "equal" | "no difference found" | "equal or not compared" | "in both" => "#cfe8cf",
         "unexpected" | "removed" | "BOOL" | "left out" | "unknown" => "#c9c9c9",
         "mismatched" | "reshaped" => "#ff8a80",
         "silent" | "changed" => "#ffb74d",
