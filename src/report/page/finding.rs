@@ -62,11 +62,16 @@ fn show(out: &mut String, place: &FilePlaces<'_>) {
     for mark in &excerpt.marks {
         let (before, marked) = (excerpt.text.get(end..mark.start), excerpt.text.get(mark.clone()));
         if let (Some(before), Some(marked)) = (before, marked) {
-            let _ok = write!(out, "{}<mark>{}</mark>", text(before), text(marked));
+            let _ok = write!(out, "{}<mark>{}</mark>", quoted(before), quoted(marked));
             end = mark.end;
         }
     }
-    let _ok = writeln!(out, "{}</pre>", text(excerpt.text.get(end..).unwrap_or_default()));
+    let _ok = writeln!(out, "{}</pre>", quoted(excerpt.text.get(end..).unwrap_or_default()));
+}
+
+/// A part of a document. A tab is shown as blanks: a page has no character that controls anything.
+fn quoted(part: &str) -> String {
+    text(&part.replace('\t', "    "))
 }
 
 /// What to do: the edits as a diff where they change texts of the report.
@@ -82,10 +87,10 @@ fn fix(out: &mut String, hint: &FixHint, checkpoint: &CheckpointReport) {
         out.push_str("<pre class=\"diff\" tabindex=\"0\">");
         for line in texts(&shown, &shown, source, &new).lines() {
             let _ok = match line.as_bytes() {
-                [b'+', b'+', b'+', ..] | [b'-', b'-', b'-', ..] => writeln!(out, "{}", text(line)),
-                [b'+', ..] => writeln!(out, "<ins>{}</ins>", text(line)),
-                [b'-', ..] => writeln!(out, "<del>{}</del>", text(line)),
-                _ => writeln!(out, "{}", text(line)),
+                [b'+', b'+', b'+', ..] | [b'-', b'-', b'-', ..] => writeln!(out, "{}", quoted(line)),
+                [b'+', ..] => writeln!(out, "<ins>{}</ins>", quoted(line)),
+                [b'-', ..] => writeln!(out, "<del>{}</del>", quoted(line)),
+                _ => writeln!(out, "{}", quoted(line)),
             };
         }
         out.push_str("</pre>\n");

@@ -9,7 +9,8 @@ use ckpt_doctor::check::compare::{ComparedBytes, changes_by_layer, compare, maps
 use ckpt_doctor::check::inspect::{CacheInput, ModuleMap, inspect};
 use ckpt_doctor::checkpoint::Checkpoint;
 use ckpt_doctor::knowledge::Knowledge;
-use ckpt_doctor::report::{Format, page};
+use ckpt_doctor::report::model::CheckpointReport;
+use ckpt_doctor::report::{Format, Report, page};
 
 use super::{samples, show};
 use crate::support::weights::{Shard, Weights, split};
@@ -209,4 +210,22 @@ fn names_of_strangers_are_text() {
     weights.write(work.path());
     let text = hold(&inspected(work.path(), name));
     assert!(text.contains("&lt;img src=x onerror=alert(1)&gt;") && !text.contains('\u{202e}'));
+}
+
+/// In an excerpt and in the diff of a fix.
+#[test]
+fn a_page_has_no_character_that_controls_anything() {
+    let work = tempfile::tempdir().unwrap();
+    crate::support::base::copy(&donor("llava3d-tiny"), work.path());
+    let config = work.path().join("config.json");
+    let text = std::fs::read_to_string(&config).unwrap();
+    let text = text.replace("\n  ", "\n\t").replace("\"vocab_size\": 340", "\"vocab_size\":\t341");
+    std::fs::write(&config, text).unwrap();
+    let (checkpoint, knowledge) = (Arc::new(Checkpoint::open(work.path()).unwrap()), Knowledge::embedded().unwrap());
+    let outcome = check(&checkpoint, &knowledge);
+    let report = Report::new(vec![CheckpointReport::new("tabs", None, &checkpoint, &outcome)], None);
+    let html = show(&report, Format::Html);
+    hold(&html);
+    assert!(html.contains("<del>") && html.contains("<mark>"), "{html}");
+    assert!(!html.contains(|c: char| c.is_control() && c != '\n'));
 }
