@@ -20,7 +20,7 @@ use crate::report::{inspect as report, page};
 /// Runs `inspect`.
 pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
     let path = &args.path;
-    let (checkpoint, inside) = opened(path)?;
+    let Opened { checkpoint, inside } = opened(path)?;
     let checkpoint = Arc::new(checkpoint);
     let listed = args.tensors.as_ref().map(|glob| list(&checkpoint, path, glob)).transpose()?;
     let name = shown(path);
@@ -31,7 +31,7 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
         let is_model = [files::CONFIG, files::INDEX, files::ADAPTER_CONFIG].into_iter().any(has);
         let loads = if is_model { check(&checkpoint, &knowledge).verdicts } else { Vec::new() };
         let mut inspection = inspect(&checkpoint, &knowledge.library, cache);
-        inspection.parts = pipeline_parts(&checkpoint, &inside);
+        inspection.parts = pipeline_parts(&checkpoint, &parts(path, &inside));
         anyhow::Ok((inspection, loads))
     });
     output::look(&args.output, |format, style| {
@@ -51,16 +51,21 @@ pub fn run(args: &InspectArgs, rules: Option<&Path>) -> anyhow::Result<u8> {
 /// Opens the checkpoint at a path, or in it, or a file of tensors. `inspect` and `diff` call it. Fails where there is none, and
 /// where there are several.
 pub(super) fn open(path: &Path) -> anyhow::Result<Checkpoint> {
-    opened(path).map(|(checkpoint, _)| checkpoint)
+    opened(path).map(|opened| opened.checkpoint)
 }
 
-/// The same with the checkpoints in its folders, by their relative paths: the parts of a pipeline.
-fn opened(path: &Path) -> anyhow::Result<(Checkpoint, Vec<(String, Checkpoint)>)> {
+/// A checkpoint, and the directories of others in its folders: the parts of a pipeline.
+struct Opened {
+    checkpoint: Checkpoint,
+    inside: Vec<PathBuf>,
+}
+
+fn opened(path: &Path) -> anyhow::Result<Opened> {
     if !path.exists() {
         bail!("{}: no such file or directory", path.display());
     }
     if let Some(shard) = alone(path) {
-        return Ok((shard, Vec::new()));
+        return Ok(Opened { checkpoint: shard, inside: Vec::new() });
     }
     let kinds = Directories::embedded()?;
     let mut found = find_checkpoints(path, &|names| kinds.recognise(names));
@@ -75,9 +80,20 @@ fn opened(path: &Path) -> anyhow::Result<(Checkpoint, Vec<(String, Checkpoint)>)
         let count = found.checkpoints.len();
         bail!("{}: contains {count} checkpoints; pass one of them, or a file of tensors", path.display());
     };
-    let open = |dir: &Path| Checkpoint::open(dir).with_context(|| dir.display().to_string());
-    let within = |part: &PathBuf| anyhow::Ok((shown(part.strip_prefix(path)?), open(part)?));
-    Ok((open(dir)?, inside.iter().map(within).collect::<anyhow::Result<_>>()?))
+    let checkpoint = Checkpoint::open(dir).with_context(|| dir.display().to_string())?;
+    Ok(Opened { checkpoint, inside })
+}
+
+/// Opens the checkpoints in the folders of one, by their relative paths. Names one that cannot be opened, and leaves it out.
+fn parts(path: &Path, inside: &[PathBuf]) -> Vec<(String, Checkpoint)> {
+    let mut parts = Vec::new();
+    for dir in inside {
+        match Checkpoint::open(dir) {
+            Ok(part) => parts.push((shown(dir.strip_prefix(path).unwrap_or(dir)), part)),
+            Err(error) => output::note(&output::safe(&format!("note: {}: {error}", dir.display()))),
+        }
+    }
+    parts
 }
 
 /// The tensors that match a pattern; fails if there is none, unless the pattern matches all. Names the files of which tensors
@@ -94,7 +110,7 @@ fn list(checkpoint: &Checkpoint, path: &Path, pattern: &str) -> anyhow::Result<V
     Ok(listed)
 }
 
-/// Opens a file of tensors as a checkpoint of its own: a pickle, or a safetensors file that has no config and no index beside it.
+/// Opens a file of tensors, safetensors or a pickle, as a checkpoint of its own, if it has no config and no index beside it.
 fn alone(path: &Path) -> Option<Checkpoint> {
     if !path.is_file() {
         return None;

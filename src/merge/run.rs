@@ -93,18 +93,16 @@ pub struct MergeRun {
     /// How the result is loaded.
     usage: Usage,
     /// Where the tensors of the result come from.
-    origins: Vec<TensorOrigin>,
+    origins: Vec<PlannedOrigin>,
 }
 
 /// Where a tensor of the result comes from.
 #[derive(Debug, Clone)]
-struct TensorOrigin {
+struct PlannedOrigin {
     /// Its name in the result.
     name: String,
-    /// Role of the donor that it stands for.
-    donor: String,
-    /// Its name there.
-    from: String,
+    /// Roles and names of the donors' tensors that it is made of; it stands for the first.
+    sources: Vec<[String; 2]>,
     transform: TensorTransform,
 }
 
@@ -161,11 +159,11 @@ impl MergeRun {
         record.transforms.clear();
         self.origins.clear();
         for (_, tensor) in draft.plan.tensors() {
-            let (main, transform) = (tensor.source.main(), tensor.transform());
+            let transform = tensor.transform();
             let count = record.transforms.entry(transform).or_default();
             *count = count.saturating_add(1);
-            let (name, donor, from) = (tensor.name.clone(), main.donor.clone(), main.name.clone());
-            self.origins.push(TensorOrigin { name, donor, from, transform });
+            let sources = tensor.source.sources().into_iter().map(|of| [of.donor.clone(), of.name.clone()]).collect();
+            self.origins.push(PlannedOrigin { name: tensor.name.clone(), sources, transform });
         }
     }
 
@@ -251,20 +249,29 @@ impl MergeRun {
         let mut report = self.report();
         let donors: Vec<(&str, &CheckedCheckpoint)> =
             self.checked.iter().filter_map(CheckedCheckpoint::donor).collect();
-        let told = |origin: &TensorOrigin| format!("{}: {}", origin.donor, origin.transform.name());
+        let told = |role: &str, transform: TensorTransform| format!("{role}: {}", transform.name());
         // All maps start with the same values, so that a donor has one colour in all of them.
-        let copies = donors.iter().map(|(role, _)| format!("{role}: {}", TensorTransform::Copy.name()));
-        let values = |other: &str| std::iter::once(other.to_owned()).chain(copies.clone()).collect();
+        let values = |other: &str| {
+            let copies = donors.iter().map(|(role, _)| told(role, TensorTransform::Copy));
+            std::iter::once(other.to_owned()).chain(copies).collect()
+        };
         for (role, checked) in &donors {
-            let used = self.origins.iter().filter(|origin| origin.donor == *role);
-            let used = used.map(|origin| (origin.from.as_str(), told(origin)));
+            // Of a tensor with several uses, the map shows the one for which a tensor of the result stands.
+            let aside =
+                self.origins.iter().flat_map(|origin| origin.sources.iter().skip(1).map(move |of| (of, origin)));
+            let main = self.origins.iter().filter_map(|origin| Some((origin.sources.first()?, origin)));
+            let used = aside.chain(main).filter(|([donor, _], _)| donor == role);
+            let used = used.map(|([donor, name], origin)| (name.as_str(), told(donor, origin.transform)));
             report.maps.push(CheckpointMap {
                 title: format!("{role}: what was taken"),
                 map: ModuleMap::by_origin(&checked.checkpoint, values("left out"), used),
             });
         }
         if let Some(result) = self.checked.iter().rfind(|checked| checked.donor().is_none()) {
-            let made = self.origins.iter().map(|origin| (origin.name.as_str(), told(origin)));
+            let made = self.origins.iter().filter_map(|origin| {
+                let [donor, _] = origin.sources.first()?;
+                Some((origin.name.as_str(), told(donor, origin.transform)))
+            });
             report.maps.push(CheckpointMap {
                 title: result.role.to_string(),
                 map: ModuleMap::by_origin(&result.checkpoint, values("unknown"), made),

@@ -36,6 +36,8 @@ pub struct Group<'a> {
     pub sources: Option<&'a BTreeMap<String, Arc<str>>>,
     /// Items in report order.
     pub items: Vec<Item<'a>>,
+    /// Whether findings that are not among `items`, because of `--min-severity`, make the run fail.
+    pub hides_failure: bool,
     /// Suppressed findings, each with the origin and reason of the suppression.
     pub suppressed: Vec<(Item<'a>, &'a Accepted)>,
 }
@@ -108,7 +110,8 @@ fn findings<'a>(
         help: finding.fix.as_ref().map(|hint| advice(hint).join("; ")),
         fingerprint: of_finding(finding, &path, &role, seen),
     };
-    let items = checkpoint.findings.iter().map(&mut item).collect();
+    let items: Vec<Item<'_>> = checkpoint.findings.iter().map(&mut item).collect();
+    let hides_failure = checkpoint.counts.worst().is_some_and(fails) && !items.iter().any(|item| item.fails);
     let suppressed = checkpoint.suppressed.iter().map(|s| (item(&s.finding), &s.accepted)).collect();
     Group {
         title,
@@ -117,6 +120,7 @@ fn findings<'a>(
         governed: governed(checkpoint).filter(|_| checkpoint.is_governed()),
         sources: Some(&checkpoint.sources),
         items,
+        hides_failure,
         suppressed,
     }
 }
@@ -153,6 +157,7 @@ fn seams<'a>(merge: &'a MergeReport, seen: &mut BTreeMap<String, usize>) -> Grou
         governed: None,
         sources: None,
         items,
+        hides_failure: false,
         suppressed: Vec::new(),
     }
 }
@@ -177,6 +182,7 @@ fn unchecked<'a>(unchecked: &UncheckedPath, seen: &mut BTreeMap<String, usize>) 
         governed: None,
         sources: None,
         items: vec![item],
+        hides_failure: false,
         suppressed: Vec::new(),
     }
 }

@@ -11,7 +11,9 @@ use super::format::{more, name, plural, sentence, shape, shortened, wrap};
 use super::json::pretty;
 use super::model::ToolInfo;
 use super::terminal::paint::Paint;
-use crate::check::compare::{ComparedBytes, Differences, DocumentChange, OneSided, PrefixChange, TensorDifferences};
+use crate::check::compare::{
+    ComparedBytes, Converted, Differences, DocumentChange, OneSided, PrefixChange, TensorDifferences,
+};
 use crate::checkpoint::{DifferenceRank, Distance, escape};
 
 /// Columns before a line that goes on with the one above.
@@ -44,13 +46,9 @@ pub fn json(before: &str, after: &str, differences: &Differences) -> String {
 pub fn full(before: &str, after: &str, differences: &Differences, style: Style) -> String {
     let paint = Paint(style.color);
     let mut out = String::new();
-    let is_whole = differences.unknown.is_empty() && differences.tensors.bytes != ComparedBytes::Sampled;
-    let verdict = match (differences.differ, is_whole) {
-        (true, _) => " differ",
-        (false, true) => ": no difference found",
-        (false, false) => ": no difference found in what was compared",
-    };
-    let _ok = writeln!(out, "{} and {}{verdict}", paint.strong(&name(before)), paint.strong(&name(after)));
+    let [one, other] = [before, after].map(|path| paint.strong(&name(path)));
+    let verdict = if differences.differ { " differ".to_owned() } else { format!(": {}", outcome(differences)) };
+    let _ok = writeln!(out, "{one} and {other}{verdict}");
     tensors(&mut out, &differences.tensors, style);
     for DocumentChange { file, values, further } in &differences.documents {
         let line = |at: &str, before: &Option<Value>, after: &Option<Value>| {
@@ -75,14 +73,38 @@ pub fn full(before: &str, after: &str, differences: &Differences, style: Style) 
     out
 }
 
-fn tensors(out: &mut String, found: &TensorDifferences, style: Style) {
-    let read = match found.bytes {
+/// The answer in a few words.
+pub(super) fn outcome(differences: &Differences) -> &'static str {
+    let is_whole = differences.unknown.is_empty() && differences.tensors.bytes != ComparedBytes::Sampled;
+    match (differences.differ, is_whole) {
+        (true, _) => "they differ",
+        (false, true) => "no difference found",
+        (false, false) => "no difference found in what was compared",
+    }
+}
+
+/// In what the tensors are equal that are counted as equal.
+pub(super) const fn equal(bytes: ComparedBytes) -> &'static str {
+    match bytes {
         ComparedBytes::Sampled => "equal in type, shape, and their first, middle and last bytes (--bytes compares all)",
         ComparedBytes::All | ComparedBytes::Measured | ComparedBytes::Ranked => "equal in type, shape and bytes",
-    };
+    }
+}
+
+/// The tensors that a loader turns into the same ones, in a sentence.
+pub(super) fn conversion(found: &Converted) -> String {
+    let (one, other) = (plural(found.before, "tensor"), plural(found.after, "tensor"));
+    format!(
+        "{one} of the first and {other} of the second have the same names and shapes once transformers {} has opened them; their bytes were not compared",
+        name(&found.loader)
+    )
+}
+
+fn tensors(out: &mut String, found: &TensorDifferences, style: Style) {
     let counts = format!("{} in the first, {} in the second", plural(found.before, "tensor"), found.after);
-    let lines =
-        [counts, format!("{} {read}", found.equal)].into_iter().filter(|_| (found.before, found.after) != (0, 0));
+    let lines = [counts, format!("{} {}", found.equal, equal(found.bytes))]
+        .into_iter()
+        .filter(|_| (found.before, found.after) != (0, 0));
     section(out, "tensors", lines, 0, style);
     let renamed = found.renamed.iter().map(|PrefixChange { from, to, tensors }| {
         let change = match (name(from), name(to)) {
@@ -93,14 +115,8 @@ fn tensors(out: &mut String, found: &TensorDifferences, style: Style) {
         format!("{change} ({})", plural(*tensors, "tensor"))
     });
     section(out, "renamed tensors, by prefix", renamed, 0, style);
-    if let Some(c) = &found.converted {
-        let (one, other) = (plural(c.before, "tensor"), plural(c.after, "tensor"));
-        let line = format!(
-            "{one} of the first and {other} of the second have the same names and shapes once transformers {} has opened them; their bytes were not compared",
-            c.loader
-        );
-        section(out, "converted tensors", std::iter::once(line), 0, style);
-    }
+    let converted = found.converted.iter().map(conversion);
+    section(out, "converted tensors", converted, 0, style);
     section(out, "tensors of the first alone", one_sided(&found.removed, style), 0, style);
     section(out, "tensors of the second alone", one_sided(&found.added, style), 0, style);
     let reshaped = found.reshaped.iter().map(|r| (format!("{} -> {}", shape(&r.before), shape(&r.after)), &*r.name));

@@ -74,15 +74,8 @@ pub fn full(
 ) -> String {
     let paint = Paint(style.color);
     let mut out = String::new();
-    let all = inspection.tensors;
     let subject = name(path);
-    let line = format!(
-        "{subject}: {}, {}, {} parameters, {}",
-        plural(inspection.files.len(), "file"),
-        plural(all.tensors, "tensor"),
-        count(all.parameters),
-        bytes(all.bytes)
-    );
+    let line = format!("{subject}: {}", totals(inspection));
     let _ok = writeln!(out, "{}", wrap(&line, style.width).replacen(&subject, &paint.strong(&subject), 1));
     if !loads.is_empty() {
         for line in [headline(loads)].into_iter().chain(objects(loads)) {
@@ -96,12 +89,12 @@ pub fn full(
     if let Some(summary) = &inspection.adapter {
         adapter(&mut out, summary, style);
     }
-    // What a pipeline is stands in its parts.
-    if inspection.parts.is_empty() || inspection.tensors.tensors > 0 {
+    if !is_pipeline(inspection) {
         class(&mut out, inspection, style);
     }
     if let Some(found) = &inspection.memory {
-        memory(&mut out, found, style);
+        let _ok = writeln!(out, "\n  memory");
+        table(&mut out, ["", "bytes", ""], &memory(found), style);
     }
     if let Some(votes) = &inspection.votes {
         values(&mut out, votes, inspection.config.is_some(), style);
@@ -110,11 +103,30 @@ pub fn full(
         let _ok = writeln!(out, "\n  {}", paint.strong("config.json inferred from the tensors (incomplete)"));
         indented(&mut out, &pretty(&inspection.proven));
     }
-    for note in &inspection.notes {
+    for note in notes(inspection) {
         out.push('\n');
         prose(&mut out, &format!("note: {}", sentence(note)), style);
     }
     out
+}
+
+/// Whether all of a directory is in its parts.
+fn is_pipeline(inspection: &Inspection) -> bool {
+    !inspection.parts.is_empty() && inspection.tensors.tensors == 0
+}
+
+/// `8 files, 76 tensors, 174.43 thousand parameters, 348 kB`; of a pipeline its parts in place of tensors.
+pub(super) fn totals(inspection: &Inspection) -> String {
+    let (files, all) = (plural(inspection.files.len(), "file"), inspection.tensors);
+    if is_pipeline(inspection) {
+        return format!("{files}, {}", plural(inspection.parts.len(), "part"));
+    }
+    format!("{files}, {}, {} parameters, {}", plural(all.tensors, "tensor"), count(all.parameters), bytes(all.bytes))
+}
+
+/// Why parts of the summary are missing. A pipeline is not expected to have them.
+pub(super) fn notes(inspection: &Inspection) -> &[String] {
+    if is_pipeline(inspection) { &[] } else { &inspection.notes }
 }
 
 fn outvoted(inspection: &Inspection) -> bool {
@@ -148,17 +160,19 @@ fn files(out: &mut String, inspection: &Inspection, style: Style) {
 }
 
 fn parts(out: &mut String, inspection: &Inspection, style: Style) {
-    let row = |part: &InspectedPart| {
-        let figure = |of: fn(&Amount) -> String| part.amount.as_ref().map(of).unwrap_or_default();
-        let class = part.class.as_deref().map(name).unwrap_or_default();
-        let [parameters, size] = [figure(|a| count(a.parameters)), figure(|a| bytes(a.bytes))];
-        [name(&part.folder), class, figure(|a| a.tensors.to_string()), parameters, size]
-    };
-    let rows: Vec<[String; 5]> = inspection.parts.iter().map(row).collect();
+    let rows: Vec<[String; 5]> = inspection.parts.iter().map(part).collect();
     if !rows.is_empty() {
         let _ok = writeln!(out, "\n  parts");
         table(out, ["", "class", "tensors", "parameters", "bytes"], &rows, style);
     }
+}
+
+/// Folder and class of a part, and the amounts of its tensors.
+pub(super) fn part(part: &InspectedPart) -> [String; 5] {
+    let figure = |of: fn(&Amount) -> String| part.amount.as_ref().map(of).unwrap_or_default();
+    let class = part.class.as_deref().map(name).unwrap_or_default();
+    let [parameters, size] = [figure(|a| count(a.parameters)), figure(|a| bytes(a.bytes))];
+    [name(&part.folder), class, figure(|a| a.tensors.to_string()), parameters, size]
 }
 
 /// What an adapter is, and the modules that it changes.
@@ -194,15 +208,13 @@ pub(super) fn target(target: &AdaptedModules) -> [String; 3] {
     [name(&target.name), target.modules.to_string(), ranks.join(", ") + &further]
 }
 
-fn memory(out: &mut String, found: &Memory, style: Style) {
+/// What takes memory, how much, and how that was reckoned.
+pub(super) fn memory(found: &Memory) -> Vec<[String; 3]> {
     let dtype = name(&found.dtype);
+    let step = format!("weights, gradients and both moments of AdamW in {dtype}, without activations");
     let mut rows = vec![
         ["weights".to_owned(), bytes(found.weights), format!("in {dtype}")],
-        [
-            "training step".to_owned(),
-            bytes(found.training),
-            format!("weights, gradients and both moments of AdamW in {dtype}, without activations"),
-        ],
+        ["training step".to_owned(), bytes(found.training), step],
     ];
     if let Some(cache) = &found.cache {
         let size = if cache.at_most { format!("≤ {}", bytes(cache.bytes)) } else { bytes(cache.bytes) };
@@ -210,8 +222,7 @@ fn memory(out: &mut String, found: &Memory, style: Style) {
         let of = format!("keys and values of {batch} of {context} in {dtype}");
         rows.push(["cache".to_owned(), size, of]);
     }
-    let _ok = writeln!(out, "\n  memory");
-    table(out, ["", "bytes", ""], &rows, style);
+    rows
 }
 
 fn plural_of(n: u64, noun: &str) -> String {

@@ -15,6 +15,8 @@ use crate::check::verdict::PredictedLoad;
 use crate::check::{Finding, Severity};
 use crate::checkpoint::{TensorContents, untold};
 use crate::knowledge::Knowledge;
+#[cfg(feature = "cli")]
+use crate::knowledge::rule::Rule;
 use crate::knowledge::settings::Policy;
 pub use crate::surgery::repair::{Fixed, Withdrawn};
 
@@ -113,16 +115,13 @@ impl Report {
     #[cfg(feature = "cli")]
     #[must_use]
     pub(crate) fn with_terms(mut self, knowledge: &Knowledge, fail_on: Option<Severity>) -> Self {
-        let accepted = |c: &CheckpointReport| c.suppressed.iter().map(|s| s.finding.code.clone()).collect::<Vec<_>>();
-        let of =
-            |c: &CheckpointReport| c.findings.iter().map(|f| f.code.clone()).chain(accepted(c)).collect::<Vec<_>>();
-        let codes: BTreeSet<String> = self.checkpoints.iter().flat_map(of).collect();
-        let rules = knowledge.rules.rules.iter().filter(|rule| codes.contains(&rule.code));
-        let texts = rules.map(|rule| {
-            let text = RuleText { summary: rule.summary.clone(), why: rule.why.clone() };
-            (rule.code.clone(), text)
-        });
-        self.terms = ReportTerms { fail_on, rules: texts.collect() };
+        let findings =
+            self.checkpoints.iter().flat_map(|c| c.findings.iter().chain(c.suppressed.iter().map(|s| &s.finding)));
+        let codes: BTreeSet<&str> = findings.map(|finding| finding.code.as_str()).collect();
+        let known = knowledge.rules.rules.iter().filter(|rule| codes.contains(rule.code.as_str()));
+        let text = |rule: &Rule| RuleText { summary: rule.summary.clone(), why: rule.why.clone() };
+        let rules = known.map(|rule| (rule.code.clone(), text(rule))).collect();
+        self.terms = ReportTerms { fail_on, rules };
         self
     }
 

@@ -68,13 +68,12 @@ fn code(raw: &str) -> String {
 
 /// A verdict in its colour.
 fn verdict(verdict: LoadVerdict) -> String {
-    let (class, word) = match verdict {
-        LoadVerdict::Loads => ("good", "loads"),
-        LoadVerdict::LoadsWrong => ("bad", "wrong"),
-        LoadVerdict::Raises => ("bad", "raises"),
-        LoadVerdict::NotPredicted => ("unknown", "not predicted"),
+    let class = match verdict {
+        LoadVerdict::Loads => "good",
+        LoadVerdict::LoadsWrong | LoadVerdict::Raises => "bad",
+        LoadVerdict::NotPredicted => "unknown",
     };
-    format!("<span class=\"badge {class}\">{word}</span>")
+    format!("<span class=\"badge {class}\">{}</span>", verdict.name())
 }
 
 /// How the cells of a column stand.

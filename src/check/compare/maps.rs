@@ -3,8 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use super::{ComparedBytes, Differences, TensorDifferences};
-use crate::check::inspect::{MapProperty, ModuleMap, Painted, PropertyKind, by_dtype};
-use crate::checkpoint::{Checkpoint, Distance, Shard, Tensor};
+use crate::check::inspect::{ModuleMap, Painted, PropertyKind, by_dtype};
+use crate::checkpoint::{Checkpoint, Distance};
 
 /// Rows of the table by layer: the kinds of tensors that changed the most.
 const ROWS: usize = 60;
@@ -16,25 +16,29 @@ const COLUMNS: usize = 200;
 #[must_use]
 pub fn maps(one: &Checkpoint, other: &Checkpoint, differences: &Differences) -> [ModuleMap; 2] {
     let found = &differences.tensors;
-    let lists: [(&str, Vec<&str>); 5] = [
-        (kept(one, found), Vec::new()),
-        ("changed", found.changed.iter().map(|one| one.name.as_str()).collect()),
-        ("recast", found.recast.iter().map(|one| one.name.as_str()).collect()),
-        ("reshaped", found.reshaped.iter().map(|one| one.name.as_str()).collect()),
-        ("removed", found.removed.iter().map(|one| one.name.as_str()).collect()),
-    ];
-    let added = [("in both", Vec::new()), ("added", found.added.iter().map(|one| one.name.as_str()).collect())];
-    let map = |checkpoint: &Checkpoint, lists: &[(&str, Vec<&str>)]| {
-        ModuleMap::new(checkpoint, &[by_list(lists), by_dtype(checkpoint)])
+    let added: HashMap<&str, usize> = found.added.iter().map(|one| (one.name.as_str(), 1)).collect();
+    let map = |checkpoint, values: &[&str], named| {
+        let values = values.iter().map(|&value| value.to_owned()).collect();
+        ModuleMap::new(checkpoint, &[Painted::by_name(PropertyKind::Change, values, named), by_dtype(checkpoint)])
     };
-    [map(one, &lists), map(other, &added)]
+    let first = [kept(one, found), "changed", "recast", "reshaped", "removed"];
+    [map(one, &first, listed(found)), map(other, &["in both", "added"], added)]
+}
+
+/// The names in the lists of differences, with the number of their list, from 1: those of the first checkpoint.
+fn listed(found: &TensorDifferences) -> HashMap<&str, usize> {
+    let changed = found.changed.iter().map(|one| (one.name.as_str(), 1));
+    let recast = found.recast.iter().map(|one| (one.name.as_str(), 2));
+    let reshaped = found.reshaped.iter().map(|one| (one.name.as_str(), 3));
+    let removed = found.removed.iter().map(|one| (one.name.as_str(), 4));
+    changed.chain(recast).chain(reshaped).chain(removed).collect()
 }
 
 /// What is known of the tensors of the first checkpoint that no list of differences names.
 fn kept(one: &Checkpoint, found: &TensorDifferences) -> &'static str {
-    let all: BTreeSet<&str> = one.tensors().map(|(_, tensor)| tensor.name.as_str()).collect();
-    let named = [found.changed.len(), found.recast.len(), found.reshaped.len(), found.removed.len()];
-    let others = all.len().saturating_sub(named.into_iter().fold(0, usize::saturating_add));
+    let listed = listed(found);
+    let names: BTreeSet<&str> = one.tensors().map(|(_, tensor)| tensor.name.as_str()).collect();
+    let others = names.iter().filter(|name| !listed.contains_key(*name)).count();
     match found.bytes {
         _ if found.equal != others => "equal or not compared",
         ComparedBytes::Sampled => "no difference found",
@@ -42,24 +46,17 @@ fn kept(one: &Checkpoint, found: &TensorDifferences) -> &'static str {
     }
 }
 
-/// By lists of names; the first list has those that no other one names.
-fn by_list<'p>(lists: &[(&str, Vec<&'p str>)]) -> Painted<'p> {
-    let places = lists.iter().enumerate().flat_map(|(at, (_, names))| names.iter().map(move |name| (*name, at)));
-    let of: HashMap<&str, usize> = places.collect();
-    let value = move |_: &Shard, tensor: &Tensor| of.get(tensor.name.as_str()).copied().unwrap_or_default();
-    let values = lists.iter().map(|(value, _)| (*value).to_owned()).collect();
-    Painted { property: MapProperty { kind: PropertyKind::Change, values }, value: Box::new(value) }
-}
-
 /// The tensors that differ in their bytes, by layer: a row for each kind of tensor, a column for each number of a layer.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ChangesByLayer {
     /// Numbers of the layers, ascending.
     pub layers: Vec<u64>,
+    /// Layers that are not among them.
+    pub further_layers: usize,
     /// Kinds of tensors, those that changed the most first.
     pub rows: Vec<ChangedKind>,
     /// Kinds that changed and are not among the rows.
-    pub further: usize,
+    pub further_rows: usize,
     /// What is known of a tensor that is not among the changed ones: `equal`.
     pub kept: &'static str,
 }
@@ -113,16 +110,17 @@ pub fn changes_by_layer(one: &Checkpoint, found: &TensorDifferences) -> ChangesB
     let mut layers: Vec<u64> = kinds.values().flat_map(|cells| cells.keys().copied()).collect();
     layers.sort_unstable();
     layers.dedup();
+    let further_layers = layers.len().saturating_sub(COLUMNS);
     layers.truncate(COLUMNS);
     let row = |(pattern, cells): (String, BTreeMap<u64, ChangedCell>)| ChangedKind {
         pattern,
         cells: layers.iter().map(|layer| cells.get(layer).copied()).collect(),
     };
     let mut rows: Vec<ChangedKind> = kinds.into_iter().map(row).collect();
-    let further = rows.len().saturating_sub(ROWS);
+    let further_rows = rows.len().saturating_sub(ROWS);
     rows.sort_by(|a, b| b.most().total_cmp(&a.most()));
     rows.truncate(ROWS);
-    ChangesByLayer { layers, rows, further, kept: kept(one, found) }
+    ChangesByLayer { layers, further_layers, rows, further_rows, kept: kept(one, found) }
 }
 
 impl ChangedKind {

@@ -48,6 +48,14 @@ pub(crate) struct Painted<'p> {
     pub(crate) value: ValueOf<'p>,
 }
 
+impl<'p> Painted<'p> {
+    /// A property by the names of tensors: places in `values`, of which the first one is that of all other names.
+    pub(crate) fn by_name(kind: PropertyKind, values: Vec<String>, of: HashMap<&'p str, usize>) -> Self {
+        let value = move |_: &Shard, tensor: &Tensor| of.get(tensor.name.as_str()).copied().unwrap_or_default();
+        Self { property: MapProperty { kind, values }, value: Box::new(value) }
+    }
+}
+
 /// The place of a tensor's value in the values of a property.
 pub(crate) type ValueOf<'p> = Box<dyn Fn(&Shard, &Tensor) -> usize + 'p>;
 
@@ -75,9 +83,7 @@ impl ModuleMap {
             });
             of.insert(name, at);
         }
-        let value = move |_: &Shard, tensor: &Tensor| of.get(tensor.name.as_str()).copied().unwrap_or_default();
-        let property = MapProperty { kind: PropertyKind::Origin, values };
-        Self::new(checkpoint, &[Painted { property, value: Box::new(value) }, by_dtype(checkpoint)])
+        Self::new(checkpoint, &[Painted::by_name(PropertyKind::Origin, values, of), by_dtype(checkpoint)])
     }
 
     /// The map of a checkpoint by these properties. Of tensors with one name, the last one tells the values.
@@ -142,13 +148,12 @@ fn by_file(checkpoint: &Checkpoint) -> Painted<'_> {
 /// By the lists of the first load report; none without one. A list that is cut, or that has the names of the class where the
 /// files have others, tells nothing of the tensors that it does not name.
 fn by_load(loads: &[PredictedLoad]) -> Option<Painted<'_>> {
-    const VALUES: [&str; 4] = ["not in a list", "unexpected", "mismatched", "silent"];
     let report = loads.iter().find_map(|load| load.tensors.as_ref())?;
     let unexpected = report.unexpected.iter().map(|name| (name.as_str(), 1));
     let mismatched = report.mismatched.iter().map(|one| (one.name.as_str(), 2));
     let silent = report.silent.iter().map(|one| (one.name.as_str(), 3));
-    let named: HashMap<&str, usize> = unexpected.chain(mismatched).chain(silent).collect();
-    let value = move |_: &Shard, tensor: &Tensor| named.get(tensor.name.as_str()).copied().unwrap_or_default();
-    let values = VALUES.map(str::to_owned).to_vec();
-    Some(Painted { property: MapProperty { kind: PropertyKind::Load, values }, value: Box::new(value) })
+    let named = unexpected.chain(mismatched).chain(silent).collect();
+    let other = format!("in no list of {}", report.loader);
+    let values = std::iter::once(other).chain(["unexpected", "mismatched", "silent"].map(str::to_owned)).collect();
+    Some(Painted::by_name(PropertyKind::Load, values, named))
 }

@@ -25,7 +25,13 @@ pub fn render(report: &Report) -> String {
         if let Some(governed) = &group.governed {
             suite.add_property(Property::new("settings", legal(governed)));
         }
-        if group.items.is_empty() {
+        if group.hides_failure {
+            let mut status = TestCaseStatus::non_success(NonSuccessKind::Failure);
+            status.set_message("findings below --min-severity, which --fail-on counts");
+            let mut case = TestCase::new("findings that are not listed", status);
+            case.set_classname(words(&group.path));
+            suite.add_test_case(case);
+        } else if group.items.is_empty() {
             let mut case = TestCase::new("clean", TestCaseStatus::success());
             case.set_classname(words(&group.path));
             suite.add_test_case(case);

@@ -4,10 +4,10 @@ use std::fmt::Write as _;
 
 use serde_json::Value;
 
-use super::super::compare::{figures, value};
+use super::super::compare::{conversion, equal, figures, outcome, value};
 use super::super::format::{and, name, plural, shape};
 use super::{Column, code, map, page, table, text, titled, words};
-use crate::check::compare::{ChangedCell, ChangesByLayer, ComparedBytes, Differences, OneSided, TensorDifferences};
+use crate::check::compare::{ChangedCell, ChangesByLayer, Differences, OneSided, TensorDifferences};
 use crate::check::inspect::ModuleMap;
 use crate::checkpoint::{DifferenceRank, Distance};
 
@@ -21,23 +21,14 @@ const CAP: usize = 2_000;
 #[must_use]
 pub fn render(paths: [&str; 2], differences: &Differences, maps: &[ModuleMap; 2], layers: &ChangesByLayer) -> String {
     let mut body = String::new();
-    let is_whole = differences.unknown.is_empty() && differences.tensors.bytes != ComparedBytes::Sampled;
-    let verdict = match (differences.differ, is_whole) {
-        (true, _) => "They differ",
-        (false, true) => "No difference found",
-        (false, false) => "No difference found in what was compared",
-    };
     let found = &differences.tensors;
-    let read = match found.bytes {
-        ComparedBytes::Sampled => "equal in type, shape, and their first, middle and last bytes",
-        ComparedBytes::All | ComparedBytes::Measured | ComparedBytes::Ranked => "equal in type, shape and bytes",
-    };
     let _ok = writeln!(
         body,
-        "<p>{} in the first, {} in the second; {} {read}.</p>\n<div class=\"two\">",
+        "<p>{} in the first, {} in the second; {} {}.</p>\n<div class=\"two\">",
         plural(found.before, "tensor"),
         found.after,
-        found.equal
+        found.equal,
+        text(equal(found.bytes))
     );
     for ((path, map), id) in paths.iter().zip(maps).zip(["before", "after"]) {
         body.push_str("<div>");
@@ -49,7 +40,7 @@ pub fn render(paths: [&str; 2], differences: &Differences, maps: &[ModuleMap; 2]
     tensors(&mut body, found);
     documents(&mut body, differences);
     titled(&mut body, "Not compared", &differences.unknown.iter().map(|text| words(text)).collect::<Vec<_>>());
-    page(&and(&paths.map(name)), verdict, &body)
+    page(&and(&paths.map(name)), outcome(differences), &body)
 }
 
 /// The changes by layer as a table of colours.
@@ -84,8 +75,10 @@ fn by_layer(out: &mut String, found: &ChangesByLayer) {
         out.push_str("</tr>\n");
     }
     out.push_str("</tbody></table></div>\n");
-    if found.further > 0 {
-        let _ok = writeln!(out, "<p class=\"dim\">and {} more kinds of tensors</p>", found.further);
+    for (further, noun) in [(found.further_rows, "row"), (found.further_layers, "layer")] {
+        if further > 0 {
+            let _ok = writeln!(out, "<p class=\"dim\">and {}</p>", plural(further, &format!("more {noun}")));
+        }
     }
 }
 
@@ -112,15 +105,8 @@ fn tensors(out: &mut String, found: &TensorDifferences) {
         .map(|change| vec![code(&change.from), code(&change.to), change.tensors.to_string()])
         .collect();
     table(out, "Renamed tensors, by prefix", &[("from", LEFT), ("to", LEFT), ("tensors", RIGHT)], &renamed);
-    if let Some(c) = &found.converted {
-        let _ok = writeln!(
-            out,
-            "<p>{} of the first and {} of the second have the same names and shapes once transformers {} has opened them; their \
-             bytes were not compared.</p>",
-            plural(c.before, "tensor"),
-            plural(c.after, "tensor"),
-            text(&name(&c.loader))
-        );
+    if let Some(converted) = &found.converted {
+        let _ok = writeln!(out, "<p>{}.</p>", text(&conversion(converted)));
     }
     let one_sided = |tensors: &[OneSided]| -> Vec<Vec<String>> {
         let row = |one: &OneSided| {

@@ -2,10 +2,10 @@
 
 use std::fmt::Write as _;
 
-use super::super::format::{bytes, headline, name, objects, plural};
-use super::super::inspect::{adapter_line, count, target};
+use super::super::format::{bytes, headline, name, objects};
+use super::super::inspect::{adapter_line, count, memory, notes, part, target, totals};
 use super::{Column, code, map, page, table, text, titled, words};
-use crate::check::inspect::{Amount, InspectedFile, InspectedPart, Inspection, Memory, ModuleMap};
+use crate::check::inspect::{InspectedFile, Inspection, ModuleMap};
 use crate::check::verdict::PredictedLoad;
 use crate::checkpoint::files;
 
@@ -16,14 +16,6 @@ const RIGHT: Column = Column::Right;
 #[must_use]
 pub fn render(path: &str, inspection: &Inspection, loads: &[PredictedLoad], map: &ModuleMap) -> String {
     let mut body = String::new();
-    let all = inspection.tensors;
-    let subtitle = format!(
-        "{}, {}, {} parameters, {}",
-        plural(inspection.files.len(), "file"),
-        plural(all.tensors, "tensor"),
-        count(all.parameters),
-        bytes(all.bytes)
-    );
     if !loads.is_empty() {
         let said: Vec<String> = std::iter::once(headline(loads)).chain(objects(loads)).collect();
         titled(&mut body, "Verdict", &said.iter().map(|line| text(line)).collect::<Vec<_>>());
@@ -32,13 +24,15 @@ pub fn render(path: &str, inspection: &Inspection, loads: &[PredictedLoad], map:
     facts(&mut body, inspection);
     if let Some(summary) = &inspection.adapter {
         let _ok = writeln!(body, "<h2>Adapter</h2>\n<p>{}</p>", words(&adapter_line(summary)));
-        let rows: Vec<Vec<String>> =
-            summary.targets.iter().map(|one| target(one).map(|cell| text(&cell)).to_vec()).collect();
-        table(&mut body, "Targets", &[("module", LEFT), ("modules", RIGHT), ("rank", RIGHT)], &rows);
+        let rows: Vec<[String; 3]> = summary.targets.iter().map(target).collect();
+        table(&mut body, "Targets", &[("module", LEFT), ("modules", RIGHT), ("rank", RIGHT)], &cells(&rows));
     }
-    parts(&mut body, inspection);
-    if let Some(memory) = &inspection.memory {
-        table(&mut body, "Memory", &[("for", LEFT), ("bytes", RIGHT), ("how", LEFT)], &memory_rows(memory));
+    let parts: Vec<[String; 5]> = inspection.parts.iter().map(part).collect();
+    let columns = [("part", LEFT), ("class", LEFT), ("tensors", RIGHT), ("parameters", RIGHT), ("bytes", RIGHT)];
+    table(&mut body, "Parts", &columns, &cells(&parts));
+    if let Some(found) = &inspection.memory {
+        let columns = [("for", LEFT), ("bytes", RIGHT), ("how", LEFT)];
+        table(&mut body, "Memory", &columns, &cells(&memory(found)));
     }
     let types = inspection.dtypes.iter();
     let rows = types.map(|(dtype, amount)| {
@@ -47,19 +41,13 @@ pub fn render(path: &str, inspection: &Inspection, loads: &[PredictedLoad], map:
     let columns = [("type", LEFT), ("tensors", RIGHT), ("parameters", RIGHT), ("bytes", RIGHT)];
     table(&mut body, "Element types", &columns, &rows.collect::<Vec<_>>());
     files(&mut body, inspection);
-    titled(&mut body, "Notes", &inspection.notes.iter().map(|note| words(note)).collect::<Vec<_>>());
-    page(&name(path), &subtitle, &body)
+    titled(&mut body, "Notes", &notes(inspection).iter().map(|note| words(note)).collect::<Vec<_>>());
+    page(&name(path), &totals(inspection), &body)
 }
 
-fn parts(out: &mut String, inspection: &Inspection) {
-    let row = |part: &InspectedPart| {
-        let figure = |of: fn(&Amount) -> String| part.amount.as_ref().map(of).unwrap_or_default();
-        let class = part.class.as_deref().map(code).unwrap_or_default();
-        let [parameters, size] = [figure(|a| count(a.parameters)), figure(|a| bytes(a.bytes))];
-        vec![code(&part.folder), class, figure(|a| a.tensors.to_string()), parameters, size]
-    };
-    let columns = [("part", LEFT), ("class", LEFT), ("tensors", RIGHT), ("parameters", RIGHT), ("bytes", RIGHT)];
-    table(out, "Parts", &columns, &inspection.parts.iter().map(row).collect::<Vec<_>>());
+/// Cells of text.
+fn cells<const N: usize>(rows: &[[String; N]]) -> Vec<Vec<String>> {
+    rows.iter().map(|row| row.iter().map(|cell| text(cell)).collect()).collect()
 }
 
 /// What config.json says, and what the tensors say.
@@ -91,21 +79,6 @@ fn facts(out: &mut String, inspection: &Inspection) {
         .collect();
     let columns = [("value", LEFT), (files::CONFIG, LEFT), ("tensors imply", LEFT), ("votes", LEFT)];
     table(out, "Config values that the tensors contradict", &columns, &rows);
-}
-
-fn memory_rows(memory: &Memory) -> Vec<Vec<String>> {
-    let dtype = text(&name(&memory.dtype));
-    let step = format!("weights, gradients and both moments of AdamW in {dtype}, without activations");
-    let mut rows = vec![
-        vec!["weights".to_owned(), bytes(memory.weights), format!("in {dtype}")],
-        vec!["training step".to_owned(), bytes(memory.training), step],
-    ];
-    if let Some(cache) = &memory.cache {
-        let size = if cache.at_most { format!("≤ {}", bytes(cache.bytes)) } else { bytes(cache.bytes) };
-        let of = format!("keys and values of a batch of {} and a context of {} in {dtype}", cache.batch, cache.context);
-        rows.push(vec!["cache".to_owned(), size, of]);
-    }
-    rows
 }
 
 /// The files, those of tensors with a bar.

@@ -123,6 +123,8 @@ fn colours(property: &MapProperty) -> Vec<Colour> {
     let mut colours = Vec::new();
     for (at, value) in property.values.iter().enumerate() {
         colours.push(match (known(value), property.kind) {
+            // What no list names.
+            (None, PropertyKind::Load) => Colour { plain: "#cfe8cf".to_owned(), hatched: false },
             (Some(colour), _) => Colour { plain: colour.to_owned(), hatched: false },
             (None, PropertyKind::Origin) => of_origin(value, &mut roles),
             (None, _) => Colour { plain: format!("hsl({} 65% 78%)", hue(at)), hatched: false },
@@ -156,7 +158,7 @@ fn known(value: &str) -> Option<&'static str> {
         "F64" => "#f4a261",
         "I8" | "U8" => "#cdb4db",
         "I32" | "U32" | "I64" | "U64" | "I16" | "U16" => "#d8c3a5",
-        "not in a list" | "equal" | "no difference found" | "equal or not compared" | "in both" => "#cfe8cf",
+        "equal" | "no difference found" | "equal or not compared" | "in both" => "#cfe8cf",
         "unexpected" | "removed" | "BOOL" | "left out" | "unknown" => "#c9c9c9",
         "mismatched" | "reshaped" => "#ff8a80",
         "silent" | "changed" => "#ffb74d",

@@ -155,6 +155,19 @@ fn a_lora_is_added_to_the_weights_that_it_names() {
     snapshot!("merge-adapter", pair.shown(&pair.merge(&[])));
 }
 
+/// The matrices of an adapter are taken, although no tensor of the result stands for them.
+#[test]
+fn the_map_of_an_adapter_shows_what_was_taken() {
+    let pair = Pair::new();
+    let page = pair.dir("page.html");
+    let run = pair.merge(&["--report", &format!("html={}", page.display())]);
+    assert_eq!(run.status.code(), Some(0), "{}", pair.shown(&run));
+    let html = fs::read_to_string(page).unwrap();
+    let (_, map) = html.split_once("<h2>adapter: what was taken</h2>").unwrap();
+    let (map, _) = map.split_once("<details").unwrap();
+    assert!(map.contains("adapter: add-product") && !map.contains("left out"), "{map}");
+}
+
 /// Without the adapter, its products cannot be made again; with other matrices, they differ.
 #[test]
 fn a_product_is_verified_with_both_donors() {
