@@ -101,7 +101,7 @@ pub struct Checkpoint {
     pub texts: BTreeMap<String, Arc<str>>,
     /// The model card; `None` when README.md is absent or was not read.
     pub card: Option<card::ModelCard>,
-    /// The base model that `adapter_config.json` names by a relative path; `None` when it is not there.
+    /// The base model of an adapter; `None` when it was not found.
     pub base: Option<adapter::AdapterBase>,
     /// Files below its folders.
     pub nested: Nested,

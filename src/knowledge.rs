@@ -13,6 +13,7 @@ pub mod initial;
 pub mod library;
 pub mod lists;
 pub mod loader;
+pub mod matrices;
 pub mod modules;
 pub mod names;
 mod ordered;
@@ -55,6 +56,7 @@ use classes::ClassNames;
 use directories::Directories;
 use embeddings::TokenEmbedding;
 use initial::InitialValues;
+use matrices::Matrices;
 use modules::LoaderModules;
 use names::LoaderNames;
 use parts::ModelParts;
@@ -134,6 +136,8 @@ pub struct Knowledge {
     pub tokenizer_parts: Table<Vec<TokenizerPart>>,
     /// Tokenizer classes that do not open tokenizer.json as it is.
     pub tokenizers: Table<TokenizerClasses>,
+    /// Modules with a weight of two dimensions.
+    pub matrices: Table<Matrices>,
     /// Model types of language models inside other models.
     pub text_types: Table<TextTypes>,
     /// Factors of classes on embeddings and image features.
@@ -184,6 +188,7 @@ impl Knowledge {
         LazyLock::force(&self.statistics);
         LazyLock::force(&self.tokenizer_parts);
         LazyLock::force(&self.tokenizers);
+        LazyLock::force(&self.matrices);
         LazyLock::force(&self.text_types);
         LazyLock::force(&self.scales);
         LazyLock::force(&self.wrappers);
@@ -223,6 +228,7 @@ impl Knowledge {
             statistics: table!(StatisticsPlaces::embedded),
             tokenizer_parts: table!(TokenizerPart::embedded),
             tokenizers: table!(TokenizerClasses::embedded),
+            matrices: table!(Matrices::embedded),
             text_types: table!(TextTypes::embedded),
             scales: table!(Scales::embedded),
             wrappers: table!(Wrappers::embedded),

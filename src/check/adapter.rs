@@ -6,6 +6,7 @@
 
 mod base;
 mod config;
+pub(super) mod fit;
 mod formats;
 mod keys;
 pub mod lora;
@@ -20,8 +21,7 @@ use serde_json::Value;
 use super::card::{base_on_hub, is_path};
 use crate::checkpoint::adapter::{Adapter, AdapterBase, PREFIX, WEIGHTS};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tensor};
-use crate::knowledge::Table;
-use crate::knowledge::peft::PeftKeys;
+use crate::knowledge::Knowledge;
 use keys::{AdapterKey, MatrixRole};
 pub use summary::{AdaptedModules, AdapterSummary};
 use targets::Targets;
@@ -31,7 +31,8 @@ type AdapterModule<'c> = BTreeMap<MatrixRole, &'c Tensor>;
 
 /// Faults of the adapter in this directory, for these versions of PEFT; without an adapter, the LoRA files of other programs.
 #[must_use]
-pub fn faults(checkpoint: &Checkpoint, table: &Table<PeftKeys>, versions: &[String]) -> Vec<Fault> {
+pub fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, versions: &[String]) -> Vec<Fault> {
+    let table = &knowledge.peft;
     let Some(adapter) = Adapter::from_checkpoint(checkpoint) else { return formats::faults(checkpoint) };
     let mut faults = Vec::new();
     if let Some((key, library)) = adapter.config().and_then(other_library) {
@@ -73,7 +74,10 @@ pub fn faults(checkpoint: &Checkpoint, table: &Table<PeftKeys>, versions: &[Stri
         faults.push(Fault::new(FaultKind::AdapterRankUnusable).at(at).with("rank", rank.cloned().unwrap_or_default()));
     }
     if let Some(tensors) = adapter.tensors() {
-        lora(checkpoint, config, tensors, &mut faults);
+        let of_base = checkpoint.base.as_ref().and_then(AdapterBase::config);
+        let model_type = of_base.and_then(|config| config.get("model_type")).and_then(Value::as_str);
+        let converted = model_type.is_some_and(|model_type| knowledge.library.converts(model_type));
+        lora(checkpoint, config, tensors, converted, &mut faults);
     }
     faults
 }
@@ -103,7 +107,8 @@ fn other_library(config: &Value) -> Option<(&'static str, &'static str)> {
     LIBRARIES.into_iter().find(|(key, _)| !is_peft && config.get(*key).is_some())
 }
 
-fn lora(checkpoint: &Checkpoint, config: &Value, tensors: &[Tensor], faults: &mut Vec<Fault>) {
+/// `converted` tells whether PEFT converts adapters for the type of the base model, and so opens bare names.
+fn lora(checkpoint: &Checkpoint, config: &Value, tensors: &[Tensor], converted: bool, faults: &mut Vec<Fault>) {
     // The order in the file tells nothing.
     let mut tensors: Vec<&Tensor> = tensors.iter().collect();
     tensors.sort_by_key(|tensor| tensor.name.as_str());
@@ -124,7 +129,7 @@ fn lora(checkpoint: &Checkpoint, config: &Value, tensors: &[Tensor], faults: &mu
                 modules.entry(module).or_default().insert(role, tensor);
                 faults.push(unread(tensor, "its name contains the name of the adapter").with("named", true));
             }
-            AdapterKey::Foreign(reason) => faults.push(unread(tensor, reason).with("named", false)),
+            AdapterKey::Foreign(reason) => faults.push(unread(tensor, reason).with("converted", converted)),
         }
     }
     let targets = Targets::from_config(config, checkpoint);
@@ -147,7 +152,6 @@ fn lora(checkpoint: &Checkpoint, config: &Value, tensors: &[Tensor], faults: &mu
         }
     }
     untargeted(config, &modules, &targets, faults);
-    faults.extend(checkpoint.base.iter().flat_map(|base| base::faults(base, &modules, &whole)));
     if modules.is_empty() && !faults.iter().any(|f| f.kind == FaultKind::AdapterKeyUnread) {
         let fault = Fault::new(FaultKind::AdapterWithoutMatrices).at(Place::file(WEIGHTS[0]));
         faults.push(fault.with("tensors", tensors.len()));
@@ -158,7 +162,11 @@ fn lora(checkpoint: &Checkpoint, config: &Value, tensors: &[Tensor], faults: &mu
         let (first, inner) = (format!("{module}."), format!(".{module}."));
         !targets.affords(whole.len(), 100) || whole.keys().any(|name| name.starts_with(&first) || name.contains(&inner))
     };
-    if !targets.saved.is_empty() && !tensors.is_empty() && !targets.saved.iter().any(is_saved) {
+    if checkpoint.base.is_none()
+        && !targets.saved.is_empty()
+        && !tensors.is_empty()
+        && !targets.saved.iter().any(is_saved)
+    {
         let at = Place::file(files::ADAPTER_CONFIG).pointer("/modules_to_save");
         faults.push(Fault::new(FaultKind::AdapterModuleNotSaved).at(at).with("modules", targets.saved.clone()));
     }
@@ -167,7 +175,7 @@ fn lora(checkpoint: &Checkpoint, config: &Value, tensors: &[Tensor], faults: &mu
 
 fn unread(tensor: &Tensor, reason: &str) -> Fault {
     let fault = Fault::new(FaultKind::AdapterKeyUnread).at(Place::tensor(&*tensor.name));
-    fault.with("tensor", tensor.name.as_str()).with("reason", reason)
+    fault.with("tensor", tensor.name.as_str()).with("reason", reason).with("named", false).with("converted", false)
 }
 
 /// The fault of names from which `.lora` was cut, with the names that they had: PEFT removes the name of the adapter from the

@@ -1,6 +1,7 @@
 //! Load reports: the lists that `from_pretrained` reports for a checkpoint, and the tensors that it loads incorrectly
 //! without a warning. One predictor for each known loader, from names and shapes alone.
 
+mod adapted;
 mod convert;
 mod difference;
 mod keys;
@@ -25,6 +26,7 @@ use crate::checkpoint::{Fault, FaultKind, Place};
 use crate::knowledge::prediction::{PredictionLayers, lies_in, numbered};
 use crate::knowledge::{Architecture, Evidence, Expected, Loader, Refusal};
 
+pub(super) use adapted::AdaptedNames;
 pub use difference::{Judged, difference};
 pub use moved::{Moved, moved};
 pub(crate) use report::version;

@@ -32,7 +32,7 @@ const OF_FILES: &[FilesObserver] = &[
     |view| pickles::faults(view.checkpoint, view.knowledge).into(),
     |view| templates::faults(view.checkpoint).into(),
     |view| tokenizer_json::faults(view.checkpoint, &view.knowledge.tokenizer_parts).into(),
-    |view| adapter::faults(view.checkpoint, &view.knowledge.peft, view.peft).into(),
+    |view| adapter::faults(view.checkpoint, view.knowledge, view.peft).into(),
     |view| tokens::faults(view.checkpoint, view.rows).into(),
 ];
 
@@ -48,6 +48,7 @@ const OF_VERSIONS: &[VersionsObserver] = &[
     |view| built_tokenizer::faults(view.checkpoint, view.knowledge, &view.asked).into(),
     |view| ropes::faults(view.checkpoint, view.knowledge, view.asked.targets).into(),
     |view| processor::faults(view).into(),
+    adapter::fit::observe,
 ];
 
 /// Explainers of all faults.
@@ -101,6 +102,7 @@ fn run<O>(table: &[O], order: RunOrder, observe: impl Fn(&O) -> Observation) -> 
     observed.into_iter().flatten().fold(Observation::default(), |mut all, one| {
         all.faults.extend(one.faults);
         all.facts.refused.extend(one.facts.refused);
+        all.facts.adapter.extend(one.facts.adapter);
         all.facts.directory = all.facts.directory.or(one.facts.directory);
         all
     })

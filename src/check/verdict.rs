@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 use super::finding::{Finding, FindingEffect};
 use super::index;
 use super::load::{LoadReport, Mismatch, SilentReason, Target, version};
+use super::view::AdapterFit;
 use crate::checkpoint::{Checkpoint, NotRead, untold};
 use crate::knowledge::program::AskedProgram;
 use crate::knowledge::rule::{Consequence, Object};
@@ -141,6 +142,8 @@ pub(super) struct Basis<'a> {
     pub(super) not_judged: Option<&'a str>,
     /// For a loader without a report, the reason.
     pub(super) unpredicted: &'a [(&'static str, String)],
+    /// For each version, whether the adapter was compared with its base model.
+    pub(super) adapter: &'a [AdapterFit],
 }
 
 impl Basis<'_> {
@@ -209,6 +212,16 @@ impl Basis<'_> {
         pickles.find_map(|(shard, pickle)| Some((shard.name.as_str(), pickle.doubt.as_deref()?)))
     }
 
+    /// The verdict where weights were not read whole, or not understood.
+    fn not_understood(&self) -> Option<(LoadVerdict, Option<String>)> {
+        let partial = self.checkpoint.is_partial().then(|| "the checkpoint is too large to be read whole".to_owned());
+        let why = partial.or_else(|| {
+            let (shard, doubt) = self.doubt()?;
+            Some(format!("{shard} was not understood: {doubt}"))
+        })?;
+        Some((LoadVerdict::NotPredicted, Some(why)))
+    }
+
     fn report(&self, loader: &str) -> Option<&LoadReport> {
         self.loads.iter().find(|report| report.loader == loader)
     }
@@ -259,20 +272,25 @@ impl Basis<'_> {
             Some((LoadVerdict::NotPredicted, Some(format!("{file} {}, and was not read", not_read.words()))))
         };
         if object != Object::Model || is_program(loader) {
-            let known = (LoadVerdict::NotPredicted, Some("only known faults are looked for".to_owned()));
-            return not_read().unwrap_or(known);
+            let known = || (LoadVerdict::NotPredicted, Some("only known faults are looked for".to_owned()));
+            let fit = self.adapter.iter().find(|fit| object == Object::Adapter && fit.loader == loader);
+            let compared = fit.map(|fit| match &fit.not_compared {
+                Some(why) => (LoadVerdict::NotPredicted, Some(why.clone())),
+                None => (LoadVerdict::Loads, None),
+            });
+            return not_read()
+                .or_else(|| self.not_understood().filter(|_| fit.is_some()))
+                .or(compared)
+                .unwrap_or_else(known);
         }
         if self.checkpoint.config().is_none() {
             return (LoadVerdict::NotPredicted, Some("there is no config.json that can be read".to_owned()));
         }
-        if self.checkpoint.is_partial() {
-            return (LoadVerdict::NotPredicted, Some("the checkpoint is too large to be read whole".to_owned()));
-        }
         if let Some(program) = self.program {
             return (LoadVerdict::NotPredicted, Some(format!("the weights are quantised for {program}")));
         }
-        if let Some((shard, doubt)) = self.doubt() {
-            return (LoadVerdict::NotPredicted, Some(format!("{shard} was not understood: {doubt}")));
+        if let Some(verdict) = self.not_understood() {
+            return verdict;
         }
         if let Some(verdict) = not_read() {
             return verdict;

@@ -71,6 +71,17 @@ pub(super) struct ExplainingFacts {
     pub(super) directory: Option<Fault>,
     /// Pointers of config values that a class refuses under some version.
     pub(super) refused: BTreeSet<String>,
+    /// What is known of the adapter with its base model, for each version.
+    pub(super) adapter: Vec<AdapterFit>,
+}
+
+/// Whether a version was asked for an adapter with its base model.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct AdapterFit {
+    /// The version.
+    pub(super) loader: &'static str,
+    /// Why the adapter was not compared; `None` where it was, and faults tell what does not fit.
+    pub(super) not_compared: Option<String>,
 }
 
 /// The result of an observer.

@@ -155,7 +155,7 @@ fn read(source: Source) -> Result<Checkpoint, OpenError> {
     checkpoint.place_pickles();
     checkpoint.derive_tokenizer(vocabularies);
     checkpoint.derive_index();
-    checkpoint.base = AdapterBase::read(&checkpoint, &mut budget);
+    checkpoint.base = AdapterBase::beside(&checkpoint, &mut budget);
     Arc::make_mut(&mut checkpoint.tokenizer).faults.extend(vocabulary_faults);
     Ok(checkpoint)
 }

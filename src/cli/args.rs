@@ -344,6 +344,10 @@ pub struct CheckArgs {
     /// not followed, except into the Hub cache
     #[arg(long, value_name = "DIR")]
     pub follow_links: Vec<PathBuf>,
+    /// The base model of the adapters. Without it, they are compared with the one beside them, with one among the paths, or with
+    /// one that was downloaded from the Hub
+    #[arg(long, value_name = "DIR")]
+    pub base: Option<PathBuf>,
     /// Directories that are checked at once, each by a process of its own [default: one for each processor, at most 16]
     #[arg(short, long, value_name = "N")]
     pub jobs: Option<NonZeroU8>,

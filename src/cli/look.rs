@@ -14,6 +14,7 @@ use super::settings::{Resolved, Typed, resolve};
 use super::{fix, output};
 use crate::check::finding::Skipped;
 use crate::check::{Outcome, SuppressionUse, check_for, suppression_uses};
+use crate::checkpoint::adapter::BaseSearch;
 use crate::checkpoint::journal::StateFolder;
 use crate::checkpoint::platform::shown;
 use crate::checkpoint::{Checkpoint, HashedFiles, ReadOptions, Source};
@@ -82,6 +83,8 @@ pub struct CheckRun<'a> {
     surroundings: Surroundings,
     /// Real paths of `--follow-links`.
     followed: Arc<[PathBuf]>,
+    /// Where base models of adapters are searched for.
+    bases: BaseSearch,
 }
 
 impl<'a> CheckRun<'a> {
@@ -91,12 +94,18 @@ impl<'a> CheckRun<'a> {
         let by = Box::leak(Box::new(resolve(&Typed::check(args, rules), &surroundings)?));
         let real = |dir: &PathBuf| dir.canonicalize().with_context(|| format!("--follow-links {}", dir.display()));
         let followed = args.follow_links.iter().map(real).collect::<anyhow::Result<_>>()?;
-        Ok(Self { args, by, surroundings, followed })
+        if let Some(base) = &args.base {
+            Source::open(base).context("--base")?;
+        }
+        let caches = BaseSearch::cache_of_user().into_iter().collect();
+        let bases = BaseSearch { named: args.base.clone(), given: dirs.to_vec(), caches };
+        Ok(Self { args, by, surroundings, followed, bases })
     }
 
     fn open(&self, dir: &Path) -> anyhow::Result<Arc<Checkpoint>> {
         let mut checkpoint = Checkpoint::read(Source::open(dir)?.following(&self.followed))?;
         checkpoint.recognise_journal(&StateFolder::of_user());
+        checkpoint.find_base(&self.bases);
         checkpoint.expect_lfs_pointers(&|top| self.surroundings.distrust(top, ".git").is_none());
         if self.args.deep || self.args.stats {
             let meter = Meter::new("reading");

@@ -252,6 +252,12 @@ impl Library {
         owner.model_types.iter().any(|model_type| self.fixed_parts.has(loader, model_type, key))
     }
 
+    /// Whether transformers 5 looks up conversions by this model type: PEFT converts adapters for such types alone.
+    pub(crate) fn converts(&self, model_type: &str) -> bool {
+        let file = self.of_model_type(model_type, Loader::NEWEST);
+        file.is_some_and(|file| file.conversions.contains_key(model_type))
+    }
+
     /// The file with the conversions of this class or model type: where it is described, or any other.
     pub(super) fn with_conversions(&self, identifier: &str) -> Option<&Blueprint> {
         let described = self.candidates(index::with_class(identifier).chain(index::with_model_type(identifier)));

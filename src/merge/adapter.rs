@@ -7,7 +7,7 @@ use serde_json::Value;
 use super::error::MergeError;
 use super::named::AnnouncedCast;
 use super::parts::Donor;
-use crate::check::adapter::lora::{Lora, LoraModule, lora};
+use crate::check::adapter::lora::{Lora, LoraModule, LoraUse, lora};
 use crate::checkpoint::adapter::Adapter;
 use crate::checkpoint::{Shard, Tensor, files};
 use crate::knowledge::{ExpectedTensor, Library, Loader};
@@ -57,7 +57,7 @@ impl MergedAdapter {
                 base.role
             )));
         }
-        let lora = lora(&adapter.checkpoint).map_err(refuse)?;
+        let lora = lora(&adapter.checkpoint, LoraUse::Merge).map_err(refuse)?;
         let tensors =
             base.checkpoint.tensors().map(|(shard, tensor)| (tensor.name.as_str(), (shard, tensor))).collect();
         let file = Adapter::from_checkpoint(&adapter.checkpoint).and_then(|adapter| adapter.file());

@@ -147,9 +147,10 @@ pub fn state() -> &'static Path {
     })
 }
 
-/// The program of this build, with [`state`].
+/// The program of this build, with [`state`], and with a cache of the Hub that is not there.
 pub fn program() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_ckpt-doctor"));
+    command.env("HF_HUB_CACHE", state().join("no-hub"));
     command.env("XDG_STATE_HOME", state()).env_remove("FORCE_COLOR").env_remove("CLICOLOR_FORCE");
     command
 }

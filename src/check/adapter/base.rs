@@ -1,4 +1,4 @@
-//! The tensors of an adapter against those of its base model, when that lies beside it.
+//! The tensors of an adapter against those that its base model stores, where the class of that is not known.
 
 use std::collections::BTreeMap;
 
@@ -6,21 +6,28 @@ use crate::checkpoint::adapter::AdapterBase;
 use crate::checkpoint::{Fault, FaultKind, Place, Tensor};
 
 use super::AdapterModule;
-use super::keys::MatrixRole;
+use super::keys::{AdapterKey, MatrixRole};
 
 /// Ends of the names of matrices that have one row for each token.
 const ROWS: [&str; 4] = ["embed_tokens", "lm_head", "word_embeddings", "wte"];
 
 /// One fault for each tensor whose shape the base model contradicts.
-pub(super) fn faults(
-    base: &AdapterBase,
-    modules: &BTreeMap<&str, AdapterModule<'_>>,
-    whole: &BTreeMap<&str, &Tensor>,
-) -> Vec<Fault> {
+pub(super) fn faults(base: &AdapterBase, tensors: &[Tensor]) -> Vec<Fault> {
+    let mut modules: BTreeMap<&str, AdapterModule<'_>> = BTreeMap::new();
+    let mut whole: BTreeMap<&str, &Tensor> = BTreeMap::new();
+    for tensor in tensors {
+        match AdapterKey::parse(&tensor.name) {
+            AdapterKey::Lora { module, role } | AdapterKey::Named { module, role } => {
+                modules.entry(module).or_default().insert(role, tensor);
+            }
+            AdapterKey::Whole(name) => drop(whole.insert(name, tensor)),
+            AdapterKey::Foreign(_) => {}
+        }
+    }
     let pairs = modules.iter().filter_map(|(name, module)| pair(base, name, module));
     let tensors = whole.iter().filter_map(|(name, tensor)| {
         let expected = base.shape(name)?;
-        (expected != tensor.shape).then(|| fault(name, tensor, &tensor.shape, expected))
+        (expected != tensor.shape).then(|| misfit(name, tensor, &tensor.shape, expected))
     });
     pairs.chain(tensors).collect()
 }
@@ -33,10 +40,11 @@ fn pair(base: &AdapterBase, name: &str, module: &AdapterModule<'_>) -> Option<Fa
     let &[out, input] = weight else { return None };
     let fits = (out, input) == (rows, columns) || (input, out) == (rows, columns);
     let odd = if input == columns { b } else { a };
-    (!fits).then(|| fault(name, odd, &[rows, columns], weight))
+    (!fits).then(|| misfit(name, odd, &[rows, columns], weight))
 }
 
-fn fault(name: &str, tensor: &Tensor, stored: &[u64], base: &[u64]) -> Fault {
+/// The fault of a tensor whose shape is not that of the base model. `stored` is what the matrices make.
+pub(super) fn misfit(name: &str, tensor: &Tensor, stored: &[u64], base: &[u64]) -> Fault {
     let module = name.strip_suffix(".weight").unwrap_or(name);
     let has_rows = ROWS.iter().any(|end| module.ends_with(end));
     let is_grown = has_rows && stored.get(1..) == base.get(1..);

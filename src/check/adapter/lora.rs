@@ -1,6 +1,6 @@
-//! What PEFT adds to a base model when it merges a LoRA, or why that cannot be said.
+//! What PEFT adds to a base model when it opens or merges a LoRA, or why that cannot be said.
 //!
-//! [`crate::merge`] calls it for a recipe with an adapter. Source: peft 0.21.2, `tuners/lora/layer.py` and `tuners/lora/model.py`.
+//! [`crate::merge`] calls it for a recipe with an adapter, and [`super::fit`] for the load of one. Source: peft 0.21.2, `tuners/lora/layer.py` and `tuners/lora/model.py`.
 
 use std::collections::BTreeMap;
 
@@ -19,6 +19,8 @@ pub struct Lora<'c> {
     pub modules: BTreeMap<&'c str, LoraModule<'c>>,
     /// Tensors of the base model that are replaced, by their names in it: `modules_to_save`, or an embedding that was resized.
     pub whole: BTreeMap<&'c str, &'c Tensor>,
+    /// Whether the biases of the modules were trained as well, and are among the whole tensors.
+    pub biases: bool,
 }
 
 /// The matrices of a module.
@@ -30,6 +32,8 @@ pub struct LoraModule<'c> {
     pub b: &'c Tensor,
     /// Whether they are those of an embedding, whose weight is `[rows, columns]`.
     pub is_embedding: bool,
+    /// The lengths that DoRA adds, one for each output.
+    pub magnitude: Option<&'c Tensor>,
     /// The factor on their product: `lora_alpha / r`, or `lora_alpha / sqrt(r)`.
     pub scaling: f64,
 }
@@ -63,26 +67,35 @@ const FREE: [&str; 22] = [
 /// Values of `init_lora_weights` that leave the weights of the base model as they are.
 const PLAIN_STARTS: [&str; 3] = ["gaussian", "eva", "orthogonal"];
 
+/// What a LoRA is read for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LoraUse {
+    /// Its matrices are placed in a base model.
+    Load,
+    /// Their product is added to the weights: nothing else may belong to it.
+    Merge,
+}
+
 /// The LoRA in this directory.
 ///
 /// # Errors
-/// Why it is none that can be merged, as a sentence without its subject, the adapter.
-pub fn lora(checkpoint: &Checkpoint) -> Result<Lora<'_>, String> {
+/// Why it is none that can be used so, as a sentence without its subject, the adapter.
+pub fn lora(checkpoint: &Checkpoint, purpose: LoraUse) -> Result<Lora<'_>, String> {
     let adapter = Adapter::from_checkpoint(checkpoint).ok_or_else(|| format!("has no {}", files::ADAPTER_CONFIG))?;
     let config = adapter.config().ok_or_else(|| format!("has no readable {}", files::ADAPTER_CONFIG))?;
     if let Some((_, library)) = other_library(config) {
-        return Err(format!("was written by {library}; only LoRAs of PEFT are merged"));
+        return Err(format!("was written by {library}; only LoRAs of PEFT are supported"));
     }
     match config.get("peft_type").and_then(Value::as_str) {
         Some("LORA") => {}
-        Some(other) => return Err(format!("is of type {}; only LORA is merged", escape(other, 40))),
-        None => return Err(format!("has no peft_type in {}; only LORA is merged", files::ADAPTER_CONFIG)),
+        Some(other) => return Err(format!("is of type {}; only LORA is supported", escape(other, 40))),
+        None => return Err(format!("has no peft_type in {}; only LORA is supported", files::ADAPTER_CONFIG)),
     }
     if let Some((key, value)) =
-        config.as_object().and_then(|keys| keys.iter().find(|(key, value)| !is_plain(key, value)))
+        config.as_object().and_then(|keys| keys.iter().find(|(key, value)| !is_plain(key, value, purpose)))
     {
         let value = escape(&value.to_string(), 60);
-        return Err(format!("sets {} to {value}, which is not merged", escape(key, 60)));
+        return Err(format!("sets {} to {value}, which is not supported", escape(key, 60)));
     }
     let tensors = adapter.tensors().ok_or_else(|| match adapter.file() {
         Some(file) if file != files::ADAPTER_WEIGHTS => {
@@ -90,12 +103,12 @@ pub fn lora(checkpoint: &Checkpoint) -> Result<Lora<'_>, String> {
         }
         _ => format!("has no readable {}", files::ADAPTER_WEIGHTS),
     })?;
-    let (modules, whole) = sorted(tensors)?;
+    let (modules, whole) = sorted(tensors, purpose)?;
     let targets = Targets::from_config(config, checkpoint);
     let is_rs = config.get("use_rslora") == Some(&Value::Bool(true));
     let mut found = BTreeMap::new();
     for (name, module) in modules {
-        found.insert(name, matrices(name, &module, &targets, is_rs)?);
+        found.insert(name, matrices(name, &module, &targets, is_rs, purpose)?);
     }
     if targets.excess().is_some() {
         return Err("has lists or patterns that are too large to be compared".to_owned());
@@ -103,14 +116,16 @@ pub fn lora(checkpoint: &Checkpoint) -> Result<Lora<'_>, String> {
     if found.is_empty() && whole.is_empty() {
         return Err("has no tensors".to_owned());
     }
-    Ok(Lora { modules: found, whole })
+    let biases = config.get("bias").is_some_and(|bias| bias == "lora_only");
+    Ok(Lora { modules: found, whole, biases })
 }
 
 /// Whether a key has a value with which PEFT merges `B @ A` times a factor.
-fn is_plain(key: &str, value: &Value) -> bool {
+fn is_plain(key: &str, value: &Value, purpose: LoraUse) -> bool {
     match (key, value) {
         (key, _) if FREE.contains(&key) => true,
-        ("bias", Value::String(word)) => word == "none",
+        ("use_dora", Value::Bool(_)) | ("init_lora_weights", Value::String(_)) if purpose == LoraUse::Load => true,
+        ("bias", Value::String(word)) => word == "none" || (purpose == LoraUse::Load && word == "lora_only"),
         ("init_lora_weights", Value::String(word)) => PLAIN_STARTS.contains(&word.as_str()),
         // The configs say what the initialisation is made with.
         ("init_lora_weights", _)
@@ -125,16 +140,16 @@ fn is_plain(key: &str, value: &Value) -> bool {
 /// The matrices by module, and the tensors of the base model.
 type Sorted<'c> = (BTreeMap<&'c str, AdapterModule<'c>>, BTreeMap<&'c str, &'c Tensor>);
 
-fn sorted(tensors: &[Tensor]) -> Result<Sorted<'_>, String> {
+fn sorted(tensors: &[Tensor], purpose: LoraUse) -> Result<Sorted<'_>, String> {
     let (mut modules, mut whole) = (BTreeMap::<&str, AdapterModule<'_>>::new(), BTreeMap::new());
     for tensor in tensors {
         let name = &tensor.name;
         match AdapterKey::parse(name) {
             AdapterKey::Lora { role: MatrixRole::Bias, .. } => {
-                return Err(format!("has the bias {}, which is not merged", escape(name, 200)));
+                return Err(format!("has the bias {}, which is not supported", escape(name, 200)));
             }
-            AdapterKey::Lora { role: MatrixRole::Magnitude, .. } => {
-                return Err(format!("has the magnitudes of DoRA {}, which are not merged", escape(name, 200)));
+            AdapterKey::Lora { role: MatrixRole::Magnitude, .. } if purpose == LoraUse::Merge => {
+                return Err(format!("has the magnitudes of DoRA {}, which are not supported", escape(name, 200)));
             }
             AdapterKey::Lora { module, role } => drop(modules.entry(module).or_default().insert(role, tensor)),
             AdapterKey::Whole(name) => drop(whole.insert(name, tensor)),
@@ -153,25 +168,35 @@ fn matrices<'c>(
     module: &AdapterModule<'c>,
     targets: &Targets<'_>,
     is_rs: bool,
+    purpose: LoraUse,
 ) -> Result<LoraModule<'c>, String> {
     let shown = || escape(name, 200);
     let pair = |(down, up)| Some((*module.get(&down)?, *module.get(&up)?));
     let mut pairs = PAIRS.into_iter().filter_map(|pair_of| Some((pair(pair_of)?, pair_of.0 == MatrixRole::EmbeddingA)));
-    let (Some(((a, b), is_embedding)), true) = (pairs.next(), module.len() == 2) else {
+    let magnitude = module.get(&MatrixRole::Magnitude).copied();
+    let length = if magnitude.is_some() { 3 } else { 2 };
+    let (Some(((a, b), is_embedding)), true) = (pairs.next(), module.len() == length) else {
         return Err(format!("does not have both matrices of {}", shown()));
     };
-    if !targets.may_cover(name) {
+    if purpose == LoraUse::Merge && !targets.may_cover(name) {
         return Err(format!("has matrices of {}, which target_modules does not name", shown()));
     }
     let (Some(rank), Some(alpha)) = (targets.rank(name), targets.alpha(name)) else {
         return Err(format!("does not say the rank and the lora_alpha of {}", shown()));
     };
+    if purpose == LoraUse::Load && magnitude.is_some() != targets.dora {
+        return Err(format!(
+            "has {} of DoRA for {}",
+            if targets.dora { "no magnitude" } else { "a magnitude" },
+            shown()
+        ));
+    }
     if rank == 0 || a.shape.first() != Some(&rank) || b.shape.get(1) != Some(&rank) {
         return Err(format!("has {:?} and {:?} for {}, whose rank is {rank}", a.shape, b.shape, shown()));
     }
     #[expect(clippy::cast_precision_loss, reason = "a rank is far below 2^52")]
     let rank = rank as f64;
-    Ok(LoraModule { a, b, is_embedding, scaling: alpha / if is_rs { rank.sqrt() } else { rank } })
+    Ok(LoraModule { a, b, is_embedding, magnitude, scaling: alpha / if is_rs { rank.sqrt() } else { rank } })
 }
 
 /// The module of a matrix in an adapter's file.

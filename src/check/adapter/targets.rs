@@ -110,7 +110,7 @@ impl<'c> Targets<'c> {
     }
 
     /// Whether `target_modules` means this module; `None` when that cannot be said here.
-    fn may_name(&self, module: &str) -> Option<bool> {
+    pub(super) fn may_name(&self, module: &str) -> Option<bool> {
         match &self.modules {
             Modules::Named(names) => {
                 let mut ends = module.match_indices('.').filter_map(|(dot, _)| module.get(dot.saturating_add(1)..));
@@ -120,6 +120,15 @@ impl<'c> Targets<'c> {
             Modules::Pattern(pattern) => self.matches(pattern, module),
             Modules::Any => None,
         }
+    }
+
+    /// The names in a list of `target_modules`.
+    pub(super) fn named(&self) -> impl Iterator<Item = &'c str> {
+        let names = match &self.modules {
+            Modules::Named(names) => Some(names),
+            Modules::Pattern(_) | Modules::Any => None,
+        };
+        names.into_iter().flatten().copied()
     }
 
     /// Whether the config certainly means this module.

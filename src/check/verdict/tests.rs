@@ -18,13 +18,14 @@ struct Case {
     findings: Vec<Finding>,
     loads: Vec<LoadReport>,
     has_processor: bool,
+    adapter: Vec<AdapterFit>,
 }
 
 impl Case {
     fn new() -> Self {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/donors/spatialvla-tiny");
         let checkpoint = Checkpoint::open(&path).unwrap();
-        Self { checkpoint, findings: Vec::new(), loads: Vec::new(), has_processor: false }
+        Self { checkpoint, findings: Vec::new(), loads: Vec::new(), has_processor: false, adapter: Vec::new() }
     }
 
     fn finding(mut self, code: &str, effects: &[(Object, &str, Consequence, &str)]) -> Self {
@@ -75,6 +76,7 @@ impl Case {
             has_processor: self.has_processor,
             not_judged: None,
             unpredicted: &[],
+            adapter: &self.adapter,
         }
     }
 
@@ -256,4 +258,23 @@ fn the_worst_known_verdict_of_an_object_is_that_of_the_directory() {
     assert_eq!(of(sound().finding("A", &[(Tokenizer, LOADER, Raises, "E")])), LoadVerdict::Raises);
     assert_eq!(of(Case::new().finding("A", &[(Tokenizer, LOADER, Wrong, "w")])), LoadVerdict::LoadsWrong);
     assert_eq!(of(Case::new()), LoadVerdict::NotPredicted);
+}
+
+#[test]
+fn an_adapter_loads_where_it_was_compared_and_read() {
+    let fit = |loader: &'static str, not_compared: Option<&str>| {
+        let mut case = Case::new();
+        case.adapter.push(AdapterFit { loader, not_compared: not_compared.map(str::to_owned) });
+        case
+    };
+    let unknown = |why: &str| found(LoadVerdict::NotPredicted, why, &[]);
+    assert_eq!(fit(LOADER, None).of(Object::Adapter), (LoadVerdict::Loads, None, Vec::new()));
+    assert_eq!(fit(LOADER, Some("no base")).of(Object::Adapter), unknown("no base"));
+    assert_eq!(fit("4.57.6", None).of(Object::Adapter), unknown("only known faults are looked for"));
+    assert_eq!(fit(LOADER, None).of(Tokenizer), unknown("only known faults are looked for"));
+    let wrong = fit(LOADER, None).finding("A", &[(Object::Adapter, LOADER, Wrong, "w")]);
+    assert_eq!(wrong.of(Object::Adapter), found(LoadVerdict::LoadsWrong, "w", &["A"]));
+    let mut partial = fit(LOADER, None);
+    partial.checkpoint.faults.push(Fault::new(FaultKind::CheckpointTooLarge));
+    assert_eq!(partial.of(Object::Adapter), unknown("the checkpoint is too large to be read whole"));
 }
