@@ -67,7 +67,9 @@ pub fn faults(checkpoint: &Checkpoint, knowledge: &Knowledge, versions: &[String
     let base = if base.is_empty() { "a base model it does not name" } else { base };
     let about = Fault::new(FaultKind::AdapterOfAModel)
         .at(Place::file(files::ADAPTER_CONFIG).pointer("/base_model_name_or_path"));
-    faults.push(about.with("base", base).with("rank", config.get("r").cloned().unwrap_or_default()));
+    let about = about.with("base", base).with("rank", config.get("r").cloned().unwrap_or_default());
+    let found = checkpoint.base.iter().map(|found| found.found.as_str()).find(|found| *found != base);
+    faults.push(found.into_iter().fold(about, |about, found| about.with("found", found)));
     let rank = config.get("r");
     if rank.is_some_and(|r| r.as_u64().is_none_or(|r| r == 0)) {
         let at = Place::file(files::ADAPTER_CONFIG).pointer("/r");

@@ -1,6 +1,8 @@
 //! The program from the outside: arguments, output and exit codes.
 
 #[cfg(unix)]
+mod adapters;
+#[cfg(unix)]
 mod check;
 #[cfg(unix)]
 mod diff;

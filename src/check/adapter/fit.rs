@@ -158,7 +158,9 @@ impl<'a> Comparison<'a> {
         }
         let total = lora.modules.len().saturating_mul(2).saturating_add(lora.whole.len());
         let is_whole = |module: &&str| found.placed.contains(*module) && !self.lacks_bias(module, lora);
-        let bare: Vec<&str> = meant.into_iter().filter(|module| !is_whole(module)).collect();
+        // Where nothing has a place, every module is bare.
+        let is_told = found.placed.is_empty() && !found.dropped.is_empty();
+        let bare: Vec<&str> = meant.into_iter().filter(|module| !is_told && !is_whole(module)).collect();
         let renames = self.renames(lora, &modules, &found);
         Ok(self.dropped(&found, total, renames).into_iter().chain(self.bare(&bare)).collect())
     }

@@ -18,6 +18,10 @@ const EXPLAINING: usize = 500_000;
 const EXPLAINING_EACH: usize = 25;
 /// Fixed cost of a build, in tensors.
 const OVERHEAD: usize = 40;
+/// Values of a config above which each costs as much as this many more: those of published ones, with a label for each of a
+/// thousand classes, are fewer.
+const MANY_VALUES: usize = 4_000;
+const LONG_LISTS: usize = 5;
 /// Stored tensors that are compared with a class at the cost of one that is built.
 const COMPARED: usize = 2;
 /// Most values of a config that are varied; a label map may have thousands.
@@ -54,7 +58,9 @@ impl<'a> Space<'a> {
         let count = evidence.iter().count();
         let compared = count.checked_div(COMPARED).unwrap_or(0);
         let budget = if explaining { EXPLAINING.saturating_add(count.saturating_mul(EXPLAINING_EACH)) } else { BUDGET };
-        let overhead = values(config).saturating_add(OVERHEAD).saturating_add(compared);
+        let values = values(config);
+        let copied = values.saturating_add(values.saturating_sub(MANY_VALUES).saturating_mul(LONG_LISTS));
+        let overhead = copied.saturating_add(OVERHEAD).saturating_add(compared);
         Self {
             architecture,
             files,

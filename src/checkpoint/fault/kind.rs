@@ -184,7 +184,7 @@ fault_kinds! {
         AdapterModuleNotSaved = "adapter-module-not-saved" { modules: List(&Text) },
         AdapterModuleUntargeted = "adapter-module-untargeted" { module: Text, count: Integer, targets?: List(&Text) },
         AdapterNamesCut = "adapter-names-cut" { tensor: Text, new: Text, count: Integer, names: List(&List(&Text)) },
-        AdapterOfAModel = "adapter-of-a-model" { base: Text, rank: Any },
+        AdapterOfAModel = "adapter-of-a-model" { base: Text, rank: Any, found?: Text },
         AdapterOfAnotherFormat = "adapter-of-another-format" { format: Text, count: Integer, shard: Text },
         AdapterPairIncomplete = "adapter-pair-incomplete" { module: Text, lacks: Text },
         AdapterRankDisagrees = "adapter-rank-disagrees" {
