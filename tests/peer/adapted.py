@@ -134,7 +134,10 @@ def mutate(rng, folder, others):
         if isinstance(targets, list):
             config["target_modules"] = {
                 "targets": targets[1:] or ["q_proj"],
-                "more-targets": [*targets, rng.choice(["o_proj", "query", "fc1", "c_attn", "dense", "lm_head", "embed_tokens"])],
+                "more-targets": [
+                    *targets,
+                    rng.choice(["o_proj", "query", "fc1", "c_attn", "dense", "lm_head", "embed_tokens"]),
+                ],
                 "unknown-target": [*targets, "never_there"],
                 "no-target": ["never_there"],
             }[what]
@@ -270,7 +273,11 @@ def outcome(one, entry, version, say):
         kind = "other fault"
     if say and kind != "right":
         why = verdict.get("why") or ", ".join(verdict.get("findings", []))
-        print(f"{kind}: {version} {one['class']} {one['what']} {one['folder']}: said {said} ({why}); {actual} {one['words']}"[:500])
+        print(
+            f"{kind}: {version} {one['class']} {one['what']} {one['folder']}: said {said} ({why}); {actual} {one['words']}"[
+                :500
+            ]
+        )
     return kind
 
 
