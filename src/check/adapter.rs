@@ -134,7 +134,7 @@ fn lora(checkpoint: &Checkpoint, config: &Value, tensors: &[Tensor], converted: 
             AdapterKey::Foreign(reason) => faults.push(unread(tensor, reason).with("converted", converted)),
         }
     }
-    let targets = Targets::from_config(config, checkpoint);
+    let targets = Targets::from_config(config, checkpoint, 1);
     // A part of the names would be renamed alone where not all were compared.
     let cut = names_cut(&targets, &whole).filter(|_| modules.is_empty() && targets.excess().is_none());
     if let Some(cut) = cut {

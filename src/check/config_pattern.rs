@@ -38,7 +38,7 @@ const PARSED_BYTE: u64 = 10_000;
 pub(super) const COMPARISON: u64 = 40;
 
 /// Judgements that share the work for the bytes of a checkpoint: a run compares the patterns once for each loader.
-const JUDGEMENTS: usize = 4;
+pub(super) const JUDGEMENTS: usize = 4;
 
 /// The work that the patterns of a document may cost: in the bytes of the document and of the names that they are compared
 /// with.

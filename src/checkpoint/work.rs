@@ -38,6 +38,11 @@ impl Work {
         self.left = self.left.saturating_add(bytes.saturating_mul(PER_BYTE));
     }
 
+    /// One of `count` equal parts of what is left, for what is done so many times.
+    pub(crate) fn part(&self, count: u64) -> Self {
+        Self { left: self.left.checked_div(count).unwrap_or(0) }
+    }
+
     /// Pays for `count` items of `units` each.
     ///
     /// # Errors

@@ -291,6 +291,15 @@ def write_patterns(rng, directory, budget):
             )
         else:
             adapter[key] = patterns
+        if rng.random() < 0.5:  # on a base model, whose class is compared with it
+            adapter |= {"base_model_name_or_path": "./base", "r": 1}
+            layers = drawn_size(rng, 3_000)
+            tensors = {
+                name: ("F32", [1, 16] if "lora_A" in name else [16, 1] if "lora_B" in name else shape)
+                for name, (_, shape) in tensors.items()
+            }
+            (directory / "base").mkdir()
+            (directory / "base/config.json").write_text(json.dumps({**LLAMA, "num_hidden_layers": layers}))
         (directory / "adapter_config.json").write_text(json.dumps(adapter))
     else:
         weights = "model.safetensors"
@@ -509,7 +518,7 @@ def one(case):
     directory.mkdir()
     try:
         KINDS[kind](rng, directory, budget)
-        size = sum(file.stat().st_size for file in directory.iterdir())
+        size = sum(file.stat().st_size for file in directory.rglob("*") if file.is_file())
         status, seconds, memory = measured(directory)
     finally:
         if not os.environ.get("KEEP"):

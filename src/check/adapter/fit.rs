@@ -8,14 +8,19 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::Value;
 
 use super::base::{faults, misfit};
-use super::lora::{Lora, LoraModule, LoraUse, lora};
+use super::lora::{Lora, LoraModule, LoraUse, READINGS, lora};
 use super::targets::Targets;
+use crate::check::config_pattern::JUDGEMENTS;
 use crate::check::load::{self, AdaptedNames, Stored, Target};
 use crate::check::view::{AdapterFit, ExplainingFacts, Observation, VersionsView};
 use crate::checkpoint::adapter::{Adapter, AdapterBase};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tensor, escape, files};
 use crate::knowledge::matrices::MatrixModule;
 use crate::knowledge::{Expected, Knowledge};
+
+/// Work of one comparison of a name with another, and the modules around a module that are compared, at most.
+const COMPARING: usize = 10;
+const AROUND: usize = 12;
 
 /// What follows from the class of the base model: whether an adapter fits under each version, and where it does not.
 pub(in crate::check) fn observe(view: &VersionsView<'_>) -> Observation {
@@ -24,9 +29,11 @@ pub(in crate::check) fn observe(view: &VersionsView<'_>) -> Observation {
         return Observation::default();
     };
     let Some(config) = adapter.config() else { return Observation::default() };
-    let lora = lora(checkpoint, LoraUse::Load).map_err(|reason| format!("the adapter {reason}"));
     let base = checkpoint.base.as_ref().ok_or_else(|| not_found(config));
-    let mut found: Vec<Fault> = Vec::new();
+    let lora =
+        base.clone().and_then(|_| lora(checkpoint, LoraUse::Load).map_err(|reason| format!("the adapter {reason}")));
+    // The faults of versions that have the same.
+    let mut found: Vec<(Vec<Fault>, Vec<&'static str>)> = Vec::new();
     let mut fits = Vec::new();
     for target in asked.targets {
         let compared = base.clone().and_then(|base| {
@@ -39,17 +46,16 @@ pub(in crate::check) fn observe(view: &VersionsView<'_>) -> Observation {
             Ok(faults) => (None, faults),
             Err(why) => (Some(why), stored().unwrap_or_default()),
         };
-        for fault in misfits {
-            let is_same = |other: &&mut Fault| {
-                (other.kind, &other.places, &other.detail) == (fault.kind, &fault.places, &fault.detail)
-            };
-            match found.iter_mut().find(is_same) {
-                Some(other) => other.loaders.push(loader),
-                None => found.push(fault.under_all([loader])),
-            }
+        match found.iter_mut().find(|(faults, _)| *faults == misfits) {
+            Some((_, loaders)) => loaders.push(loader),
+            None => found.push((misfits, vec![loader])),
         }
         fits.push(AdapterFit { loader, not_compared });
     }
+    let under = |(faults, loaders): (Vec<Fault>, Vec<&'static str>)| {
+        faults.into_iter().map(move |fault| fault.under_all(loaders.iter().copied()))
+    };
+    let found: Vec<Fault> = found.into_iter().flat_map(under).collect();
     Observation { faults: found, facts: ExplainingFacts { adapter: fits, ..ExplainingFacts::default() } }
 }
 
@@ -105,11 +111,14 @@ impl<'a> Comparison<'a> {
         if base.shapes().iter().any(differs) {
             return Err(format!("its base model does not fit its own {}", files::CONFIG));
         }
+        let targets = Targets::from_config(config, checkpoint, READINGS);
+        let bytes = base.shapes().keys().fold(0_usize, |sum, name| sum.saturating_add(name.len()).saturating_add(64));
+        targets.grant(bytes / JUDGEMENTS);
         Ok(Self {
             knowledge,
             base,
             expected,
-            targets: Targets::from_config(config, checkpoint),
+            targets,
             narrowed: Narrowed::from_config(config)?,
             named: config.get("target_modules").unwrap_or(&Value::Null),
         })
@@ -156,7 +165,8 @@ impl<'a> Comparison<'a> {
         if !found.misfits.is_empty() {
             return Ok(found.misfits);
         }
-        let total = lora.modules.len().saturating_mul(2).saturating_add(lora.whole.len());
+        let of_pairs = lora.modules.values().map(|pair| if pair.magnitude.is_some() { 3 } else { 2 });
+        let total = of_pairs.fold(lora.whole.len(), usize::saturating_add);
         let is_whole = |module: &&str| found.placed.contains(*module) && !self.lacks_bias(module, lora);
         // Where nothing has a place, every module is bare.
         let is_told = found.placed.is_empty() && !found.dropped.is_empty();
@@ -181,6 +191,11 @@ impl<'a> Comparison<'a> {
     /// The modules that PEFT puts matrices on.
     fn meant<'m>(&self, modules: &BTreeSet<&'m str>) -> Result<Vec<&'m str>, String> {
         let mut meant = Vec::new();
+        let too_large = || "the lists of the adapter are too large to be compared".to_owned();
+        let each = self.narrowed.comparisons().saturating_add(self.targets.saved.len().saturating_mul(AROUND));
+        if !self.targets.affords(modules.len(), each.saturating_mul(COMPARING)) {
+            return Err(too_large());
+        }
         for module in modules {
             let named = self.targets.may_name(module);
             let named = named.ok_or_else(|| "target_modules is not a list, or too large to be compared".to_owned())?;
@@ -226,11 +241,10 @@ impl<'a> Comparison<'a> {
 
     /// The names of `modules_to_save` of which the class has a module and the file has not all tensors: PEFT raises.
     fn unsaved(&self, modules: &BTreeSet<&str>, lora: &Lora<'_>) -> Vec<&str> {
-        let is_stored = |module: &str| {
-            let mut of_module = self.expected.tensors.keys().filter(|name| lies_in(name, module));
-            of_module.all(|name| lora.whole.contains_key(name.as_str()))
-        };
-        let lacks = |saved: &&&str| modules.iter().filter(|m| m.ends_with(**saved)).any(|module| !is_stored(module));
+        let absent = self.expected.tensors.keys().filter(|name| !lora.whole.contains_key(name.as_str()));
+        let around = |name| std::iter::successors(parent(name), |name| parent(name));
+        let lacking: BTreeSet<&str> = absent.map(String::as_str).flat_map(around).collect();
+        let lacks = |saved: &&&str| modules.iter().any(|module| module.ends_with(**saved) && lacking.contains(module));
         self.targets.saved.iter().filter(lacks).copied().collect()
     }
 
@@ -256,7 +270,8 @@ impl<'a> Comparison<'a> {
     /// Old and new names with which every dropped matrix fits: one part at the start of names is replaced. `None` where that
     /// is not certain.
     fn renames(&self, lora: &Lora<'_>, modules: &BTreeSet<&str>, found: &Found<'_>) -> Option<Vec<(String, String)>> {
-        if found.dropped.is_empty() || !found.placed.is_empty() || !lora.whole.is_empty() {
+        let is_all = !found.dropped.is_empty() && found.placed.is_empty() && lora.whole.is_empty();
+        if !is_all || !self.targets.affords(modules.len(), lora.modules.len().saturating_mul(COMPARING)) {
             return None;
         }
         let (first, _) = lora.modules.first_key_value()?;
@@ -353,6 +368,11 @@ impl<'a> Narrowed<'a> {
         Ok(Self { excluded: texts("exclude_modules")?, layers, targets })
     }
 
+    /// How many names a module is compared with.
+    fn comparisons(&self) -> usize {
+        self.excluded.len().saturating_add(self.targets.len()).saturating_add(self.layers.len())
+    }
+
     /// Whether a module that `target_modules` means gets matrices.
     fn keeps(&self, module: &str, saved: &[&str]) -> bool {
         let is = |name: &&str| ends_with(module, name);
@@ -383,11 +403,6 @@ fn as_python_has_it(targets: &Value) -> String {
 /// The module around a tensor or a module.
 fn parent(name: &str) -> Option<&str> {
     name.rsplit_once('.').map(|(module, _)| module)
-}
-
-/// Whether a tensor lies in a module.
-fn lies_in(name: &str, module: &str) -> bool {
-    name.strip_prefix(module).is_some_and(|rest| rest.starts_with('.'))
 }
 
 /// Whether the last parts of a module's name are these.

@@ -64,6 +64,9 @@ const FREE: [&str; 22] = [
     "use_rslora",
 ];
 
+/// Times that a check reads a LoRA for versions of transformers, at most: the work of one judgement is divided by it.
+pub(super) const READINGS: u64 = 4;
+
 /// Values of `init_lora_weights` that leave the weights of the base model as they are.
 const PLAIN_STARTS: [&str; 3] = ["gaussian", "eva", "orthogonal"];
 
@@ -104,7 +107,7 @@ pub fn lora(checkpoint: &Checkpoint, purpose: LoraUse) -> Result<Lora<'_>, Strin
         _ => format!("has no readable {}", files::ADAPTER_WEIGHTS),
     })?;
     let (modules, whole) = sorted(tensors, purpose)?;
-    let targets = Targets::from_config(config, checkpoint);
+    let targets = Targets::from_config(config, checkpoint, if purpose == LoraUse::Load { READINGS } else { 1 });
     let is_rs = config.get("use_rslora") == Some(&Value::Bool(true));
     let mut found = BTreeMap::new();
     for (name, module) in modules {

@@ -40,11 +40,12 @@ enum Modules<'c> {
 }
 
 impl<'c> Targets<'c> {
-    pub(super) fn from_config(config: &'c Value, checkpoint: &Checkpoint) -> Self {
+    /// What the config says; a `part` of the work that the size of the adapter allows may be spent on it.
+    pub(super) fn from_config(config: &'c Value, checkpoint: &Checkpoint, part: u64) -> Self {
         let list = |key: &str| -> Vec<&'c str> {
             config.get(key).and_then(Value::as_array).into_iter().flatten().filter_map(Value::as_str).collect()
         };
-        let mut work = allowance(checkpoint, checkpoint.document(files::ADAPTER_CONFIG));
+        let mut work = allowance(checkpoint, checkpoint.document(files::ADAPTER_CONFIG)).part(part);
         let mut exceeded = false;
         let mut compiled = |text: &str| {
             if exceeded {
@@ -79,6 +80,11 @@ impl<'c> Targets<'c> {
             work: RefCell::new(work),
             exceeded: Cell::new(exceeded),
         }
+    }
+
+    /// Adds the work for the names of a base model.
+    pub(super) fn grant(&self, bytes: usize) {
+        self.work.borrow_mut().grant(u64::try_from(bytes).unwrap_or(u64::MAX));
     }
 
     /// The fault of lists and patterns that would cost more to compare than the size of the adapter explains.

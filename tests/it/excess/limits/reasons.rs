@@ -95,8 +95,12 @@ const REASONS: &[(&[&str], &str)] = &[
         "Larger files are read twice where their pointer has another hash.",
     ),
     (
-        &["src/checkpoint/adapter.rs MAX_SHARDS"],
-        "The shapes of the base model are unknown then, and the load of the adapter is not predicted.",
+        &["src/checkpoint/adapter/base.rs MAX_SHARDS"],
+        "The other shards of the base model are unknown then; its class follows from its config.",
+    ),
+    (
+        &["src/checkpoint/adapter/base.rs MAX_CONFIG", "src/checkpoint/adapter/base.rs MAX_COMMIT"],
+        "The base model is unknown then, and the load of the adapter is not predicted.",
     ),
     (
         &[
