@@ -2,7 +2,7 @@
 """Write which modules with a weight of two dimensions are no `torch.nn.Linear` to rules/matrices.json. For maintainers.
 
     python tools/loader_matrices.py            # replace the entries of this version
-    python tools/loader_matrices.py --check    # fail if 30 model types, drawn by the date, differ
+    python tools/loader_matrices.py --check    # fail if 12 model types, drawn by the date, differ
 
 Every class that an Auto class builds is built without its weights, small. `convolution` has the names of modules with a weight of
 more dimensions that are convolutions without groups wherever they occur. A module is known by the last part of its name. Kinds
@@ -90,7 +90,7 @@ def collect(families):
 def main():
     families = catalogue.families()
     if "--check" in sys.argv[1:]:
-        return differing(random.Random(str(datetime.date.today())).sample(families, 30))
+        return differing(random.Random(str(datetime.date.today())).sample(families, 12))
     found, wide = collect(families)
     convolution = sorted(leaf for leaf, are in wide.items() if are == {True})
     alone = {k: sorted(leaf for leaf, kinds in found.items() if set(kinds) == {k}) for k in KINDS}
