@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """LoRAs of PEFT on models of drawn classes: what `check` says of the adapter, and what PEFT does with it.
 
-    adapted.py PEFT:FOLDER... [--adapters N] [--classes N] [--seed S] [--list] [--keep DIRECTORY]
+    adapted.py PEFT:FOLDER... [--adapters N] [--classes N] [--pairs N] [--seed S] [--list] [--keep DIRECTORY]
 
 Each argument has one version of PEFT and one of transformers, for the Python that runs this. The base models are those of
 differential.py: configs of the Hub, made small, of a drawn class. On each, LoRAs with drawn configs are saved by PEFT, and more
@@ -9,7 +9,7 @@ than half of them are damaged afterwards: in their config, their names, their sh
 --for` that version says `raises`, `loads wrong`, `loads` or `not predicted` of the adapter. PEFT opens it on the base model: it raises,
 or the tensors that the adapter has then are those of the file, all of them and no others, or they are not.
 
-Then each version opens those that the others saved. The counts are printed for each pair of versions: `loads` where PEFT does not is a false clean, a verdict where PEFT loads a false alarm.
+Then each version opens those that the others saved, or N drawn pairs of versions do. The counts are printed for each pair of versions: `loads` where PEFT does not is a false clean, a verdict where PEFT loads a false alarm.
 """
 
 import argparse
@@ -307,6 +307,7 @@ def main():
     p.add_argument("folder", nargs="+")
     p.add_argument("--adapters", type=int, default=200, help="for each version")
     p.add_argument("--classes", type=int, default=40)
+    p.add_argument("--pairs", type=int, default=6)
     p.add_argument("--seed", default="1")
     p.add_argument("--list", action="store_true", help="print every verdict that is not right")
     p.add_argument("--keep", type=Path)
@@ -316,6 +317,7 @@ def main():
         work = a.keep or temporary
         made = list(pool.map(lambda folder: run_worker(folder, work, a), a.folder))
         pairs = [(folder, of, by) for of, _ in made for folder, (by, _) in zip(a.folder, made, strict=True) if of != by]
+        pairs = random.Random(a.seed).sample(pairs, min(a.pairs, len(pairs)))
 
         def cross(pair):
             folder, of, by = pair
