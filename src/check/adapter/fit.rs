@@ -18,6 +18,9 @@ use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tensor, escape, fil
 use crate::knowledge::matrices::MatrixModule;
 use crate::knowledge::{Expected, Knowledge};
 
+/// Why an adapter with more rows than its base model has is not predicted.
+const OTHER_ROWS: &str = "it has other rows than its base model, which has to be resized before";
+
 /// Work of one comparison of a name with another, and the modules around a module that are compared, at most.
 const COMPARING: usize = 10;
 const AROUND: usize = 12;
@@ -43,7 +46,8 @@ pub(in crate::check) fn observe(view: &VersionsView<'_>) -> Observation {
         let loader = target.loader.version();
         let stored = || base.as_ref().ok().zip(adapter.tensors()).map(|(base, tensors)| faults(base, tensors));
         let (not_compared, misfits) = match compared {
-            Ok(faults) => (None, faults),
+            // Whoever trains new tokens resizes the base model before, as `AutoPeftModel` does for the adapter's tokenizer.
+            Ok(faults) => (faults.iter().any(has_other_rows).then(|| OTHER_ROWS.to_owned()), faults),
             Err(why) => (Some(why), stored().unwrap_or_default()),
         };
         match found.iter_mut().find(|(faults, _)| *faults == misfits) {
@@ -57,6 +61,11 @@ pub(in crate::check) fn observe(view: &VersionsView<'_>) -> Observation {
     };
     let found: Vec<Fault> = found.into_iter().flat_map(under).collect();
     Observation { faults: found, facts: ExplainingFacts { adapter: fits, ..ExplainingFacts::default() } }
+}
+
+/// Whether a fault is that of a matrix with another number of token rows.
+fn has_other_rows(fault: &Fault) -> bool {
+    fault.detail.get("rows") == Some(&Value::Bool(true))
 }
 
 /// Why nothing is known of the base model.

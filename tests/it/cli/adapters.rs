@@ -102,6 +102,28 @@ fn a_download_is_found_by_its_branch_or_commit() {
     assert!(of().contains("was not found"), "a branch is no path");
 }
 
+/// Whoever trains new tokens resizes the base model before, so it is not known whether the adapter opens.
+#[test]
+fn other_rows_than_those_of_the_base_model_are_not_predicted() {
+    let of = |rows: u64| {
+        let room = room("../llama");
+        edit(&room.path().join("lora"), "modules_to_save", &json!(["lm_head"]));
+        let shard = room.path().join("lora/adapter_model.safetensors");
+        let bytes = fs::read(&shard).unwrap();
+        let length = usize::try_from(u64::from_le_bytes(bytes[..8].try_into().unwrap())).unwrap();
+        let mut header: Value = serde_json::from_slice(&bytes[8..8 + length]).unwrap();
+        let (start, size) = (bytes.len() - 8 - length, usize::try_from(rows * 16 * 4).unwrap());
+        header["base_model.model.lm_head.weight"] =
+            json!({ "dtype": "F32", "shape": [rows, 16], "data_offsets": [start, start + size] });
+        let header = header.to_string();
+        let values = [&bytes[8 + length..], &vec![1; size]].concat();
+        fs::write(&shard, [&(header.len() as u64).to_le_bytes()[..], header.as_bytes(), &values].concat()).unwrap();
+        said(room.path(), Path::new("/nowhere"), &["lora"])
+    };
+    assert_eq!(of(16), "loads");
+    assert!(of(19).starts_with("not-predicted: it has other rows"), "{}", of(19));
+}
+
 #[test]
 fn a_base_model_that_is_missing_ends_the_run() {
     let room = room("llama");
