@@ -428,7 +428,7 @@ fn by_verdict(loads: &[&PredictedLoad], title: &str) -> String {
     parts.join("; ")
 }
 
-/// A sentence for each object that does not load, and for a model that is not predicted; then one for the other objects.
+/// A sentence for each object that does not load, and for a model or adapter that is not predicted; then one for the other objects.
 pub fn objects(loads: &[PredictedLoad]) -> Vec<String> {
     let mut lines = Vec::new();
     let mut unjudged: Vec<&ObjectVerdict> = Vec::new();
@@ -448,7 +448,9 @@ pub fn objects(loads: &[PredictedLoad]) -> Vec<String> {
         let why = sentence(object.why.as_deref().unwrap_or_default());
         match object.verdict {
             LoadVerdict::Loads => {}
-            LoadVerdict::NotPredicted if object.object != Object::Model => unjudged.push(object),
+            LoadVerdict::NotPredicted if !matches!(object.object, Object::Model | Object::Adapter) => {
+                unjudged.push(object);
+            }
             verdict => {
                 let codes: Vec<String> = object.findings.iter().map(|code| name(code)).collect();
                 let codes = if codes.is_empty() { String::new() } else { format!(" ({})", codes.join(", ")) };

@@ -71,8 +71,8 @@ fn has_other_rows(fault: &Fault) -> bool {
 /// Why nothing is known of the base model.
 fn not_found(config: &Value) -> String {
     match config.get("base_model_name_or_path").and_then(Value::as_str).filter(|base| !base.is_empty()) {
-        Some(base) => format!("its base model {} was not found; --base DIR compares them", escape(base, 120)),
-        None => "it names no base model; --base DIR compares them".to_owned(),
+        Some(base) => format!("its base model {} was not found; check --base DIR compares them", escape(base, 120)),
+        None => "it names no base model; check --base DIR compares them".to_owned(),
     }
 }
 

@@ -52,7 +52,7 @@ fn said(dir: &Path, hub: &Path, args: &[&str]) -> String {
 fn a_base_model_is_named_given_near_or_downloaded() {
     let nowhere = Path::new("/nowhere");
     let of = |base: &str, args: &[&str]| said(room(base).path(), nowhere, args);
-    let unknown = |base: &str| format!("not-predicted: its base model {base} was not found; --base DIR compares them");
+    let unknown = |base: &str| format!("not-predicted: its base model {base} was not found; check --base DIR compares them");
     assert_eq!(of("someone/llama", &["lora"]), unknown("someone/llama"));
     assert_eq!(of("someone/llama", &["lora", "--base", "llama"]), "loads");
     assert_eq!(of("../llama", &["lora"]), "loads");
