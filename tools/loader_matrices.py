@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Write which modules with a weight of two dimensions are no `torch.nn.Linear` to rules/matrices.json. For maintainers.
+"""Write what the modules with a weight of two dimensions are to rules/matrices.json. For maintainers.
 
     python tools/loader_matrices.py            # replace the entries of this version
     python tools/loader_matrices.py --check    # fail if 12 model types, drawn by the date, differ
 
 Every class that an Auto class builds is built without its weights, small. `convolution` has the names of modules with a weight of
 more dimensions that are convolutions without groups wherever they occur. A module is known by the last part of its name. Kinds
-are `embedding`, `turned` (transformers' Conv1D, whose weight is [in, out]) and `other` (no LoRA of PEFT can be put on it). A name
-that is of one kind wherever it occurs stands alone; another one with the model types by kind, those of `linear` included.
+are `linear`, `embedding`, `turned` (transformers' Conv1D, whose weight is [in, out]) and `other` (no LoRA of PEFT can be put on it). A name
+that is of one kind wherever it occurs stands alone; another one with the model types by kind. One that no class has is in no list.
 """
 
 import datetime
@@ -32,7 +32,7 @@ from derive.build import build, without_initialisation
 
 FILE = Path(__file__).resolve().parents[1] / "rules" / "matrices.json"
 CONVOLUTIONS = (nn.Conv1d, nn.Conv2d, nn.Conv3d)
-KINDS = ("embedding", "turned", "other")
+KINDS = ("linear", "embedding", "turned", "other")
 
 
 def shrink(config, depth=0):
@@ -106,7 +106,7 @@ def differing(families):
     wrong = []
     for leaf, kinds in found.items():
         for kind, types in kinds.items():
-            of = table["by_type"].get(leaf, {known.get(leaf, "linear"): types})
+            of = table["by_type"].get(leaf, {known.get(leaf, "new"): types})
             wrong += [f"{leaf} is {kind} in {t}" for t in types if t not in of.get(kind, ())]
     wrong += [f"{leaf} is no convolution" for leaf, are in wide.items() if False in are and leaf in table["convolution"]]
     print(f"{FILE.name}, {transformers.__version__}: {len(found) + len(wide)} names; differing: {'; '.join(wrong) or 'none'}")

@@ -13,7 +13,7 @@ use crate::knowledge::directories::Directories;
 pub(super) fn observe(view: &VersionsView<'_>) -> Observation {
     let directory = fault(view.checkpoint, &view.knowledge.directories, view.scope);
     let facts = ExplainingFacts { directory: directory.clone(), ..ExplainingFacts::default() };
-    Observation { faults: directory.into_iter().collect(), facts }
+    Observation { faults: directory.into_iter().collect(), facts, ..Observation::default() }
 }
 
 /// The fault that tells the kind of a directory; `None` for a checkpoint of transformers and for an unknown kind.

@@ -71,6 +71,7 @@ struct CheckFacts<'a> {
     checkpoint: &'a Arc<Checkpoint>,
     knowledge: &'a Knowledge,
     options: &'a RunOptions,
+    peft: &'a [String],
     programs: &'a [AskedProgram<'a>],
     stored: Stored,
     /// Rows of the largest token embedding, which every token id must stay below; `None` without one.
@@ -169,7 +170,7 @@ impl<'a> CheckFacts<'a> {
         checkpoint: &'a Arc<Checkpoint>,
         knowledge: &'a Knowledge,
         options: &'a RunOptions,
-        peft: &[String],
+        peft: &'a [String],
         programs: &'a [AskedProgram<'a>],
     ) -> Self {
         let rows = embedding_rows(checkpoint, &knowledge.token_embedding);
@@ -180,6 +181,7 @@ impl<'a> CheckFacts<'a> {
             checkpoint,
             knowledge,
             options,
+            peft,
             programs,
             stored,
             rows,
@@ -277,6 +279,7 @@ impl<'a> CheckFacts<'a> {
             knowledge,
             asked: Asked { targets: &targets, named: !versions.is_empty() },
             loads: &outcome.loads,
+            peft: self.peft,
             of_loads: &of_loads,
             filled: &outcome.config,
             model: &model,
@@ -290,7 +293,7 @@ impl<'a> CheckFacts<'a> {
         scope.bind("program", &program.into());
         outcome.loads.iter_mut().for_each(LoadReport::shorten);
         let context = Context::new(checkpoint, targets, self.programs, &outcome.loads);
-        let adapter = observed.facts.adapter;
+        let adapter = observed.adapter;
         LoaderView { context, scope, faults, opened, unpredicted: judged.unpredicted, adapter, outcome }
     }
 

@@ -102,7 +102,7 @@ fn run<O>(table: &[O], order: RunOrder, observe: impl Fn(&O) -> Observation) -> 
     observed.into_iter().flatten().fold(Observation::default(), |mut all, one| {
         all.faults.extend(one.faults);
         all.facts.refused.extend(one.facts.refused);
-        all.facts.adapter.extend(one.facts.adapter);
+        all.adapter.extend(one.adapter);
         all.facts.directory = all.facts.directory.or(one.facts.directory);
         all
     })

@@ -75,7 +75,8 @@ pub(super) fn observe(view: &VersionsView<'_>) -> Observation {
         }
     }
     faults.extend(quantisation(knowledge, config, &asked));
-    Observation { faults, facts: ExplainingFacts { refused: refused_keys, ..ExplainingFacts::default() } }
+    let facts = ExplainingFacts { refused: refused_keys, ..ExplainingFacts::default() };
+    Observation { faults, facts, ..Observation::default() }
 }
 
 /// Removes the fault that a class is unknown, where it refuses a value: it is not known with that value, and nothing else is to

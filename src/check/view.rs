@@ -52,6 +52,8 @@ pub(super) struct VersionsView<'v> {
     pub(super) asked: Asked<'v>,
     /// The whole predicted load reports.
     pub(super) loads: &'v [LoadReport],
+    /// The versions of PEFT that the user named.
+    pub(super) peft: &'v [String],
     /// Faults of the predicted loads.
     pub(super) of_loads: &'v [Fault],
     /// config.json with the defaults of the class; null when no class was built.
@@ -71,11 +73,9 @@ pub(super) struct ExplainingFacts {
     pub(super) directory: Option<Fault>,
     /// Pointers of config values that a class refuses under some version.
     pub(super) refused: BTreeSet<String>,
-    /// What is known of the adapter with its base model, for each version.
-    pub(super) adapter: Vec<AdapterFit>,
 }
 
-/// Whether a version was asked for an adapter with its base model.
+/// Whether an adapter was compared with its base model under a version.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct AdapterFit {
     /// The version.
@@ -89,6 +89,8 @@ pub(super) struct AdapterFit {
 pub(super) struct Observation {
     pub(super) faults: Vec<Fault>,
     pub(super) facts: ExplainingFacts,
+    /// For each version, whether the adapter was compared with its base model.
+    pub(super) adapter: Vec<AdapterFit>,
 }
 
 impl<F: IntoIterator<Item = Fault>> From<F> for Observation {

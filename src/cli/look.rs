@@ -98,7 +98,7 @@ impl<'a> CheckRun<'a> {
             Source::open(base).context("--base")?;
         }
         let caches = BaseSearch::cache_of_user().into_iter().collect();
-        let bases = BaseSearch { named: args.base.clone(), given: dirs.to_vec(), caches };
+        let bases = BaseSearch::new(args.base.clone(), dirs.to_vec(), caches);
         Ok(Self { args, by, surroundings, followed, bases })
     }
 

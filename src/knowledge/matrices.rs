@@ -1,4 +1,4 @@
-//! Modules with a weight of at least two dimensions that are no `torch.nn.Linear`.
+//! What the modules of classes are that have a weight of at least two dimensions.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -28,6 +28,7 @@ pub enum MatrixModule {
 #[derive(Debug, Clone, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct MatrixNames {
+    linear: BTreeSet<String>,
     embedding: BTreeSet<String>,
     turned: BTreeSet<String>,
     other: BTreeSet<String>,
@@ -64,11 +65,12 @@ impl Matrices {
             let mut of_type = kinds.iter().filter(|(_, types)| types.contains(model_type)).map(|(kind, _)| *kind);
             return of_type.next().filter(|_| of_type.next().is_none());
         }
-        Some(match leaf {
-            _ if names.embedding.contains(leaf) => MatrixModule::Embedding,
-            _ if names.turned.contains(leaf) => MatrixModule::Turned,
-            _ if names.other.contains(leaf) => MatrixModule::Other,
-            _ => MatrixModule::Linear,
-        })
+        let kinds = [
+            (&names.linear, MatrixModule::Linear),
+            (&names.embedding, MatrixModule::Embedding),
+            (&names.turned, MatrixModule::Turned),
+            (&names.other, MatrixModule::Other),
+        ];
+        kinds.into_iter().find_map(|(names, kind)| names.contains(leaf).then_some(kind))
     }
 }

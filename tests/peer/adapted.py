@@ -24,7 +24,7 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from differential import BATCH, bases, prepared, start_worker
+from differential import BATCH, bases, prepared, told_by
 from fresh import version_in
 from peer import Tally, check, workplace
 
@@ -238,13 +238,7 @@ def worker(rows_file, work, seed, adapters, classes):
 def run_worker(folder, work, a):
     """The adapters of one version."""
     version = version_in(folder.split(":")[-1])
-    of_version = work / version
-    told = of_version / "told.jsonl"
-    if not told.exists():
-        shutil.rmtree(of_version, ignore_errors=True)
-        of_version.mkdir(parents=True)
-        start_worker(__file__, folder, of_version, a.seed, str(a.adapters), str(a.classes))
-    return version, [json.loads(line) for line in told.read_text().splitlines()]
+    return version, told_by(__file__, folder, work / version, a.seed, a.adapters, a.classes)
 
 
 def opened_by(folder, told, out):

@@ -411,16 +411,20 @@ def start_worker(script, folder, place, *arguments):
     return done.stdout
 
 
+def told_by(script, folder, place, *arguments):
+    """What the worker of `script` told of its cases under the version in `folder`; it runs if it has not yet."""
+    told = place / "told.jsonl"
+    if not told.exists():
+        shutil.rmtree(place, ignore_errors=True)
+        place.mkdir(parents=True)
+        start_worker(script, folder, place, *map(str, arguments))
+    return [json.loads(line) for line in told.read_text().splitlines()]
+
+
 def run_worker(folder, work, a):
     """The mutants of one version."""
     version = version_in(folder)
-    of_version = work / version
-    told = of_version / "told.jsonl"
-    if not told.exists():
-        shutil.rmtree(of_version, ignore_errors=True)
-        of_version.mkdir(parents=True)
-        start_worker(__file__, folder, of_version, a.seed, str(a.mutants), str(a.classes))
-    return version, [json.loads(line) for line in told.read_text().splitlines()]
+    return version, told_by(__file__, folder, work / version, a.seed, a.mutants, a.classes)
 
 
 def main():

@@ -12,11 +12,16 @@ use super::lora::{Lora, LoraModule, LoraUse, READINGS, lora};
 use super::targets::Targets;
 use crate::check::config_pattern::JUDGEMENTS;
 use crate::check::load::{self, AdaptedNames, Stored, Target};
-use crate::check::view::{AdapterFit, ExplainingFacts, Observation, VersionsView};
-use crate::checkpoint::adapter::{Adapter, AdapterBase};
+use crate::check::model_type::has_code;
+use crate::check::view::{AdapterFit, Observation, VersionsView};
+use crate::checkpoint::adapter::{Adapter, AdapterBase, PREFIX};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tensor, escape, files};
 use crate::knowledge::matrices::MatrixModule;
+use crate::knowledge::quantization::stated;
 use crate::knowledge::{Expected, Knowledge};
+
+/// The versions of PEFT that are known: its last minor version.
+const OF_PEFT: &str = "0.21";
 
 /// Why an adapter with more rows than its base model has is not predicted.
 const OTHER_ROWS: &str = "it has other rows than its base model, which has to be resized before";
@@ -27,12 +32,17 @@ const AROUND: usize = 12;
 
 /// What follows from the class of the base model: whether an adapter fits under each version, and where it does not.
 pub(in crate::check) fn observe(view: &VersionsView<'_>) -> Observation {
-    let VersionsView { checkpoint, knowledge, asked, .. } = *view;
+    let VersionsView { checkpoint, knowledge, asked, peft, .. } = *view;
     let Some(adapter) = Adapter::from_checkpoint(checkpoint).filter(|adapter| adapter.file().is_some()) else {
         return Observation::default();
     };
     let Some(config) = adapter.config() else { return Observation::default() };
-    let base = checkpoint.base.as_ref().ok_or_else(|| not_found(config));
+    let other = peft.iter().find(|version| !version.starts_with(OF_PEFT));
+    let base = match (&checkpoint.base, other) {
+        (None, _) => Err(not_found(config)),
+        (_, Some(other)) => Err(format!("what PEFT {other} does with the base model is not known")),
+        (Some(base), None) => Ok(base),
+    };
     let lora =
         base.clone().and_then(|_| lora(checkpoint, LoraUse::Load).map_err(|reason| format!("the adapter {reason}")));
     // The faults of versions that have the same.
@@ -41,7 +51,7 @@ pub(in crate::check) fn observe(view: &VersionsView<'_>) -> Observation {
     for target in asked.targets {
         let compared = base.clone().and_then(|base| {
             let lora = lora.as_ref().map_err(Clone::clone)?;
-            Comparison::new(checkpoint, knowledge, config, base, target)?.faults(lora)
+            ComparedAdapter::new(checkpoint, knowledge, config, base, target)?.faults(lora)
         });
         let loader = target.loader.version();
         let stored = || base.as_ref().ok().zip(adapter.tensors()).map(|(base, tensors)| faults(base, tensors));
@@ -60,7 +70,7 @@ pub(in crate::check) fn observe(view: &VersionsView<'_>) -> Observation {
         faults.into_iter().map(move |fault| fault.under_all(loaders.iter().copied()))
     };
     let found: Vec<Fault> = found.into_iter().flat_map(under).collect();
-    Observation { faults: found, facts: ExplainingFacts { adapter: fits, ..ExplainingFacts::default() } }
+    Observation { faults: found, adapter: fits, ..Observation::default() }
 }
 
 /// Whether a fault is that of a matrix with another number of token rows.
@@ -77,7 +87,7 @@ fn not_found(config: &Value) -> String {
 }
 
 /// The class of the base model under one version, and the modules that the adapter's config means there.
-struct Comparison<'a> {
+struct ComparedAdapter<'a> {
     knowledge: &'a Knowledge,
     base: &'a AdapterBase,
     expected: Expected,
@@ -87,7 +97,7 @@ struct Comparison<'a> {
     named: &'a Value,
 }
 
-impl<'a> Comparison<'a> {
+impl<'a> ComparedAdapter<'a> {
     /// # Errors
     /// Why the class is not known.
     fn new(
@@ -101,6 +111,12 @@ impl<'a> Comparison<'a> {
         let of_base = base.config().ok_or_else(|| format!("{} of its base model was not read", files::CONFIG))?;
         if of_base.get("architectures").is_none_or(Value::is_null) {
             return Err(format!("{} of its base model names no class", files::CONFIG));
+        }
+        if let Some((_, method)) = stated(of_base) {
+            return Err(format!("its base model is quantised ({})", escape(method, 40)));
+        }
+        if has_code(of_base) {
+            return Err("the class of its base model is code of its own".to_owned());
         }
         let names: Vec<&str> = base.shapes().keys().map(String::as_str).collect();
         let known = knowledge.library.stands_for(version, of_base, &names);
@@ -152,7 +168,7 @@ impl<'a> Comparison<'a> {
             let at = Place::file(files::ADAPTER_CONFIG).pointer("/modules_to_save");
             return Ok(vec![Fault::new(FaultKind::AdapterModuleNotSaved).at(at).with("modules", unsaved)]);
         }
-        let mut found = Found::default();
+        let mut found = PlacedTensors::default();
         let mut names = AdaptedNames::new(&self.expected, &self.knowledge.library);
         let is_moved = !self.named.is_array() || self.targets.named().any(AdaptedNames::is_of_experts);
         if names.fuses() && is_moved {
@@ -184,7 +200,7 @@ impl<'a> Comparison<'a> {
         Ok(self.dropped(&found, total, renames).into_iter().chain(self.bare(&bare)).collect())
     }
 
-    /// Whether the file has not the bias of a module that it has trained with the matrices.
+    /// Whether the file lacks the bias of a module, where biases were trained with the matrices.
     fn lacks_bias(&self, module: &str, lora: &Lora<'_>) -> bool {
         lora.biases
             && self.expected.tensors.contains_key(&format!("{module}.bias"))
@@ -193,8 +209,7 @@ impl<'a> Comparison<'a> {
 
     /// The modules of the class that have tensors, and those around them.
     fn modules(&self) -> BTreeSet<&str> {
-        let around = |name| std::iter::successors(parent(name), |name| parent(name));
-        self.expected.tensors.keys().map(String::as_str).flat_map(around).collect()
+        self.expected.tensors.keys().flat_map(|name| around(name)).collect()
     }
 
     /// The modules that PEFT puts matrices on.
@@ -251,14 +266,13 @@ impl<'a> Comparison<'a> {
     /// The names of `modules_to_save` of which the class has a module and the file has not all tensors: PEFT raises.
     fn unsaved(&self, modules: &BTreeSet<&str>, lora: &Lora<'_>) -> Vec<&str> {
         let absent = self.expected.tensors.keys().filter(|name| !lora.whole.contains_key(name.as_str()));
-        let around = |name| std::iter::successors(parent(name), |name| parent(name));
-        let lacking: BTreeSet<&str> = absent.map(String::as_str).flat_map(around).collect();
+        let lacking: BTreeSet<&str> = absent.flat_map(|name| around(name)).collect();
         let lacks = |saved: &&&str| modules.iter().any(|module| module.ends_with(**saved) && lacking.contains(module));
         self.targets.saved.iter().filter(lacks).copied().collect()
     }
 
     /// The tensors that the file has whole.
-    fn whole<'c>(&self, lora: &Lora<'c>, kinds: &BTreeMap<&str, MatrixModule>, found: &mut Found<'c>) {
+    fn whole<'c>(&self, lora: &Lora<'c>, kinds: &BTreeMap<&str, MatrixModule>, found: &mut PlacedTensors<'c>) {
         for (name, tensor) in &lora.whole {
             let (bare, is_inner) = match name.split_once(".base_layer.") {
                 Some((module, end)) => (format!("{module}.{end}"), true),
@@ -278,7 +292,12 @@ impl<'a> Comparison<'a> {
 
     /// Old and new names with which every dropped matrix fits: one part at the start of names is replaced. `None` where that
     /// is not certain.
-    fn renames(&self, lora: &Lora<'_>, modules: &BTreeSet<&str>, found: &Found<'_>) -> Option<Vec<(String, String)>> {
+    fn renames(
+        &self,
+        lora: &Lora<'_>,
+        modules: &BTreeSet<&str>,
+        found: &PlacedTensors<'_>,
+    ) -> Option<Vec<(String, String)>> {
         let is_all = !found.dropped.is_empty() && found.placed.is_empty() && lora.whole.is_empty();
         if !is_all || !self.targets.affords(modules.len(), lora.modules.len().saturating_mul(COMPARING)) {
             return None;
@@ -302,10 +321,9 @@ impl<'a> Comparison<'a> {
             (common > 0 && fits(start, new)).then_some((start, new))
         });
         let (start, new) = starts.next().filter(|only| starts.all(|other| other == *only))?;
-        let prefix = crate::checkpoint::adapter::PREFIX;
         let renamed = |tensor: &&Tensor| {
-            let end = tensor.name.strip_prefix(prefix)?.strip_prefix(start)?;
-            Some((tensor.name.clone(), format!("{prefix}{new}{end}")))
+            let end = tensor.name.strip_prefix(PREFIX)?.strip_prefix(start)?;
+            Some((tensor.name.clone(), format!("{PREFIX}{new}{end}")))
         };
         found.dropped.iter().map(renamed).collect()
     }
@@ -315,7 +333,12 @@ impl<'a> Comparison<'a> {
     }
 
     /// The fault of tensors that PEFT drops.
-    fn dropped(&self, found: &Found<'_>, total: usize, renames: Option<Vec<(String, String)>>) -> Option<Fault> {
+    fn dropped(
+        &self,
+        found: &PlacedTensors<'_>,
+        total: usize,
+        renames: Option<Vec<(String, String)>>,
+    ) -> Option<Fault> {
         let mut dropped = found.dropped.clone();
         dropped.sort_by_key(|tensor| tensor.name.as_str());
         let first = dropped.first()?;
@@ -328,7 +351,7 @@ impl<'a> Comparison<'a> {
         Some(fault.with("new", new).with("names", pairs))
     }
 
-    /// The fault of modules that get new matrices.
+    /// The fault of modules of which the file lacks what was trained.
     fn bare(&self, bare: &[&str]) -> Option<Fault> {
         let at = Place::file(files::ADAPTER_CONFIG).pointer("/target_modules");
         let fault = self.about(Fault::new(FaultKind::AdapterModulesBare).at(at));
@@ -338,7 +361,7 @@ impl<'a> Comparison<'a> {
 
 /// What became of the tensors of an adapter.
 #[derive(Default)]
-struct Found<'c> {
+struct PlacedTensors<'c> {
     /// Modules of the class that have their matrices.
     placed: BTreeSet<String>,
     /// Tensors without a place.
@@ -386,9 +409,8 @@ impl<'a> Narrowed<'a> {
     fn keeps(&self, module: &str, saved: &[&str]) -> bool {
         let is = |name: &&str| ends_with(module, name);
         // Those of modules_to_save are trained whole, with all that is in them.
-        let in_saved = |saved: &&str| {
-            std::iter::successors(Some(module), |name| parent(name)).any(|around| ends_with(around, saved))
-        };
+        let in_saved =
+            |saved: &&str| std::iter::once(module).chain(around(module)).any(|module| ends_with(module, saved));
         let in_layers = || {
             // Two parts before the number, and one behind it.
             let inner = parent(module).unwrap_or_default();
@@ -412,6 +434,11 @@ fn as_python_has_it(targets: &Value) -> String {
 /// The module around a tensor or a module.
 fn parent(name: &str) -> Option<&str> {
     name.rsplit_once('.').map(|(module, _)| module)
+}
+
+/// The modules around a tensor or a module, the innermost first.
+fn around(name: &str) -> impl Iterator<Item = &str> {
+    std::iter::successors(parent(name), |name| parent(name))
 }
 
 /// Whether the last parts of a module's name are these.

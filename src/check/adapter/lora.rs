@@ -1,6 +1,7 @@
 //! What PEFT adds to a base model when it opens or merges a LoRA, or why that cannot be said.
 //!
-//! [`crate::merge`] calls it for a recipe with an adapter, and [`super::fit`] for the load of one. Source: peft 0.21.2, `tuners/lora/layer.py` and `tuners/lora/model.py`.
+//! [`crate::merge`] calls it for a recipe with an adapter, and [`super::fit`] for the load of one.
+//! Source: peft 0.21.2, `tuners/lora/layer.py` and `tuners/lora/model.py`.
 
 use std::collections::BTreeMap;
 
@@ -127,7 +128,7 @@ pub fn lora(checkpoint: &Checkpoint, purpose: LoraUse) -> Result<Lora<'_>, Strin
 fn is_plain(key: &str, value: &Value, purpose: LoraUse) -> bool {
     match (key, value) {
         (key, _) if FREE.contains(&key) => true,
-        ("use_dora", Value::Bool(_)) | ("init_lora_weights", Value::String(_)) if purpose == LoraUse::Load => true,
+        ("use_dora", Value::Bool(_)) if purpose == LoraUse::Load => true,
         ("bias", Value::String(word)) => word == "none" || (purpose == LoraUse::Load && word == "lora_only"),
         ("init_lora_weights", Value::String(word)) => PLAIN_STARTS.contains(&word.as_str()),
         // The configs say what the initialisation is made with.

@@ -84,7 +84,7 @@ mod tests {
         AdaptedNames::new(&expected, &Library::embedded()).name(module)
     }
 
-    /// Each answer was seen with PEFT 0.21.2.
+    /// The last two are of the kinds of CLIP's text model and of Mllama, which `tests/peer/adapted.py` opens.
     #[test]
     fn peft_renames_by_the_class_or_by_the_type() {
         let is = |name: &str| Some(name.to_owned());

@@ -18,8 +18,8 @@ const EXPLAINING: usize = 500_000;
 const EXPLAINING_EACH: usize = 25;
 /// Fixed cost of a build, in tensors.
 const OVERHEAD: usize = 40;
-/// Values of a config above which each costs as much as this many more: those of published ones, with a label for each of a
-/// thousand classes, are fewer.
+/// Values of a config above which each costs as much as this many more, because a search copies them for every candidate. A
+/// label for each of a thousand classes is below it.
 const MANY_VALUES: usize = 4_000;
 const LONG_LISTS: usize = 5;
 /// Stored tensors that are compared with a class at the cost of one that is built.

@@ -1,8 +1,9 @@
 //! The base model of an adapter: where it is searched for, and what is read of it.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::ffi::OsString;
 use std::path::{Component, Path, PathBuf};
+use std::sync::OnceLock;
 
 use serde_json::Value;
 
@@ -17,6 +18,9 @@ const MAX_SHARDS: usize = 300;
 /// Largest config.json of a base model, in bytes.
 const MAX_CONFIG: u64 = 4 << 20;
 
+/// Start of the name of a repository's folder in a cache.
+const REPOSITORY: &str = "models--";
+
 /// Largest file with the commit of a branch, in bytes.
 const MAX_COMMIT: u64 = 200;
 
@@ -30,17 +34,40 @@ pub struct AdapterBase {
 }
 
 /// Where the base model of an adapter is searched for, besides a relative path beside the adapter. `cli` makes one for a run.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Default)]
 pub struct BaseSearch {
-    /// The directory that the user names as the base model of every adapter.
-    pub named: Option<PathBuf>,
-    /// The directories of the run.
-    pub given: Vec<PathBuf>,
-    /// Folders of huggingface_hub with the models of the Hub that were downloaded.
-    pub caches: Vec<PathBuf>,
+    named: Option<PathBuf>,
+    given: Vec<PathBuf>,
+    caches: Vec<PathBuf>,
+    /// What may mean a directory of the run, with the first one that it means. Only a run with an adapter asks.
+    meanings: OnceLock<HashMap<PathBuf, PathBuf>>,
 }
 
 impl BaseSearch {
+    /// `named` is the base model of every adapter of the run, `given` are the directories of the run, and `caches` folders of
+    /// huggingface_hub with the models of the Hub that were downloaded.
+    #[must_use]
+    pub const fn new(named: Option<PathBuf>, given: Vec<PathBuf>, caches: Vec<PathBuf>) -> Self {
+        Self { named, given, caches, meanings: OnceLock::new() }
+    }
+
+    /// The directory of the run that a name means: by its path, or as the repository of the Hub.
+    fn given(&self, name: &str) -> Option<&Path> {
+        let meanings = self.meanings.get_or_init(|| {
+            let mut found = HashMap::new();
+            for dir in &self.given {
+                for meaning in meanings(dir) {
+                    found.entry(meaning).or_insert_with(|| dir.clone());
+                }
+            }
+            found
+        });
+        let as_id = || id(name).and_then(|id| meanings.get(Path::new(&folder_of(id))));
+        let as_path = || meanings.get(&Path::new(name).canonicalize().ok()?);
+        let found = id(name).and_then(|id| meanings.get(Path::new(id)));
+        found.or_else(as_id).or_else(as_path).map(PathBuf::as_path)
+    }
+
     /// The folder of downloads that the environment names: `$HF_HUB_CACHE`, else `$HF_HOME/hub`, else
     /// `huggingface/hub` in `$XDG_CACHE_HOME` or `~/.cache`. It need not exist. Source: huggingface_hub 2.4.0, `constants.py`.
     #[must_use]
@@ -102,16 +129,21 @@ impl Checkpoint {
     /// `base_model_name_or_path` means, a directory that PEFT would open from the working directory, or a download. An absolute
     /// path that only the adapter names is not opened. Called after opening a directory that a user named.
     pub fn find_base(&mut self, search: &BaseSearch) {
-        let Some(name) = name_of_base(self) else { return };
-        let beside = || self.base.is_some().then_some(None);
-        let named = search.named.as_ref().map(|path| Some(path.clone()));
-        let found = named.or_else(beside).or_else(|| {
-            let given = search.given.iter().find(|dir| means(name, dir)).cloned();
-            Some(Some(given.or_else(|| from_here(name)).or_else(|| downloaded(name, self, search))?))
-        });
-        let Some(Some(path)) = found else { return };
-        let base = AdapterBase::read(&Source::from(path.as_path()), shown(&path), &mut Budget::default());
-        self.base = Some(base);
+        if Adapter::from_checkpoint(self).is_none() {
+            return;
+        }
+        let path = match &search.named {
+            Some(named) => Some(named.clone()),
+            None if self.base.is_some() => None,
+            None => name_of_base(self).and_then(|name| {
+                let given = search.given(name).map(Path::to_owned);
+                given.or_else(|| from_here(name)).or_else(|| downloaded(name, self, search))
+            }),
+        };
+        if let Some(path) = path {
+            let read = AdapterBase::read(&Source::from(path.as_path()), shown(&path), &mut Budget::default());
+            self.base = Some(read);
+        }
     }
 }
 
@@ -127,13 +159,14 @@ fn is_near(path: &Path) -> bool {
     path.components().all(is_part) && path.components().count() <= 4
 }
 
-/// Whether a directory that the user gave is the base model of this name: by its path, or as the repository of the Hub.
-fn means(name: &str, dir: &Path) -> bool {
-    let is_same = || dir.canonicalize().is_ok_and(|dir| Path::new(name).canonicalize().is_ok_and(|named| named == dir));
-    let in_cache = |folder: &str| dir.components().any(|part| part.as_os_str() == folder);
-    let is_repository =
-        || id(name).is_some_and(|id| (id.contains('/') && dir.ends_with(id)) || in_cache(&folder_of(id)));
-    is_repository() || is_same()
+/// What may mean a directory that the user gave: its real path, its last two parts as an id of the Hub, and the folder of its
+/// repository in a cache.
+fn meanings(dir: &Path) -> Vec<PathBuf> {
+    let name = |path: &Path| path.file_name().map(PathBuf::from);
+    let id = name(dir).zip(dir.parent().and_then(name)).map(|(last, owner)| owner.join(last));
+    // CACHE/models--ORG--NAME/snapshots/COMMIT
+    let repository = dir.parent().and_then(Path::parent).and_then(name);
+    dir.canonicalize().ok().into_iter().chain(id).chain(repository.filter(|name| is_repository(name))).collect()
 }
 
 /// The directory that transformers opens for a relative path.
@@ -154,7 +187,12 @@ fn id(name: &str) -> Option<&str> {
 
 /// The folder of a repository in a cache. Source: `repo_folder_name` in huggingface_hub 2.4.0, `file_download.py`.
 fn folder_of(id: &str) -> String {
-    format!("models--{}", id.replace('/', "--"))
+    format!("{REPOSITORY}{}", id.replace('/', "--"))
+}
+
+/// Whether a folder has the name of a repository of models in a cache.
+fn is_repository(folder: &Path) -> bool {
+    folder.to_str().is_some_and(|name| name.starts_with(REPOSITORY))
 }
 
 /// The snapshot of a repository in the cache that the adapter lies in, or in one of the user.
@@ -162,12 +200,9 @@ fn downloaded(name: &str, checkpoint: &Checkpoint, search: &BaseSearch) -> Optio
     let id = id(name)?;
     let revision = checkpoint.document(files::ADAPTER_CONFIG)?.get("/revision").and_then(Value::as_str);
     let own = checkpoint.source.directory().and_then(|dir| dir.canonicalize().ok());
-    // CACHE/models--ORG--NAME/snapshots/COMMIT
-    let own = own.and_then(|dir| {
-        let repository = dir.parent()?.parent()?;
-        let is_cached = repository.file_name()?.to_str()?.starts_with("models--");
-        is_cached.then(|| repository.parent().map(Path::to_owned))?
-    });
+    let repository = own.as_deref().and_then(Path::parent).and_then(Path::parent);
+    let repository = repository.filter(|path| path.file_name().is_some_and(|name| is_repository(Path::new(name))));
+    let own = repository.and_then(Path::parent).map(Path::to_owned);
     let mut repositories = own.iter().chain(&search.caches).map(|cache| cache.join(folder_of(id)));
     repositories.find_map(|repository| {
         let revision = self::id(revision.unwrap_or("main"))?;
@@ -234,7 +269,9 @@ mod tests {
             ("name", "hub/models--name/snapshots/1", true),
             ("org/name", "hub/models--org--names/snapshots/1", false),
         ] {
-            assert_eq!(means(name, Path::new(dir)), expected, "{name} {dir}");
+            let given = vec![PathBuf::from("other/dir"), PathBuf::from(dir)];
+            let search = BaseSearch::new(None, given, Vec::new());
+            assert_eq!(search.given(name), expected.then_some(Path::new(dir)), "{name} {dir}");
         }
     }
 }

@@ -52,9 +52,12 @@ fn said(dir: &Path, hub: &Path, args: &[&str]) -> String {
 fn a_base_model_is_named_given_near_or_downloaded() {
     let nowhere = Path::new("/nowhere");
     let of = |base: &str, args: &[&str]| said(room(base).path(), nowhere, args);
-    let unknown = |base: &str| format!("not-predicted: its base model {base} was not found; check --base DIR compares them");
+    let unknown =
+        |base: &str| format!("not-predicted: its base model {base} was not found; check --base DIR compares them");
     assert_eq!(of("someone/llama", &["lora"]), unknown("someone/llama"));
     assert_eq!(of("someone/llama", &["lora", "--base", "llama"]), "loads");
+    assert_eq!(of("", &["lora"]), "not-predicted: it names no base model; check --base DIR compares them");
+    assert_eq!(of("", &["lora", "--base", "llama"]), "loads");
     assert_eq!(of("../llama", &["lora"]), "loads");
     // As transformers resolves it, and as a directory of the run.
     assert_eq!(of("llama", &["lora"]), "loads");
@@ -122,6 +125,40 @@ fn other_rows_than_those_of_the_base_model_are_not_predicted() {
     };
     assert_eq!(of(16), "loads");
     assert!(of(19).starts_with("not-predicted: it has other rows"), "{}", of(19));
+}
+
+/// What was not tried with PEFT is not said to load.
+#[test]
+fn bases_and_versions_that_were_not_tried_are_not_predicted() {
+    let of = |key: &str, value: Value, args: &[&str]| {
+        let room = room("../llama");
+        let path = room.path().join("llama/config.json");
+        let mut config: Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
+        config[key] = value;
+        fs::write(path, config.to_string()).unwrap();
+        said(room.path(), Path::new("/nowhere"), &[&["lora"], args].concat())
+    };
+    for (key, value, args, why) in [
+        (
+            "quantization_config",
+            json!({ "quant_method": "gptq" }),
+            &[] as &[&str],
+            "its base model is quantised (gptq)",
+        ),
+        ("auto_map", json!({ "AutoConfig": "own.Config" }), &[], "the class of its base model is code of its own"),
+        ("architectures", Value::Null, &[], "config.json of its base model names no class"),
+        ("hidden_size", json!(32), &[], "its base model does not fit its own config.json"),
+        (
+            "unused",
+            json!(1),
+            &["--for", "5.23.0,peft==0.13.2"],
+            "what PEFT 0.13.2 does with the base model is not known",
+        ),
+    ] {
+        let said = of(key, value, args);
+        assert!(said.starts_with("not-predicted: ") && said.contains(why), "{key}: {said}");
+    }
+    assert_eq!(of("unused", json!(1), &["--for", "5.23.0,peft==0.21.2"]), "loads");
 }
 
 #[test]
