@@ -17,6 +17,7 @@ mod finite;
 pub mod fix;
 #[cfg(feature = "cli")]
 pub mod foreseen;
+mod generation;
 pub mod index;
 pub mod inspect;
 pub mod judge;

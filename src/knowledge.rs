@@ -9,6 +9,7 @@ pub mod embeddings;
 pub mod evidence;
 pub mod expression;
 mod fixed_parts;
+pub mod generation;
 pub mod initial;
 pub mod library;
 pub mod lists;
@@ -55,6 +56,7 @@ pub use loader::Loader;
 use classes::ClassNames;
 use directories::Directories;
 use embeddings::TokenEmbedding;
+use generation::GenerationTable;
 use initial::InitialValues;
 use matrices::Matrices;
 use modules::LoaderModules;
@@ -136,6 +138,8 @@ pub struct Knowledge {
     pub tokenizer_parts: Table<Vec<TokenizerPart>>,
     /// Tokenizer classes that do not open tokenizer.json as it is.
     pub tokenizers: Table<TokenizerClasses>,
+    /// What `GenerationConfig` does with values.
+    pub generation: Table<GenerationTable>,
     /// Modules with a weight of two dimensions.
     pub matrices: Table<Matrices>,
     /// Model types of language models inside other models.
@@ -188,6 +192,7 @@ impl Knowledge {
         LazyLock::force(&self.statistics);
         LazyLock::force(&self.tokenizer_parts);
         LazyLock::force(&self.tokenizers);
+        LazyLock::force(&self.generation);
         LazyLock::force(&self.matrices);
         LazyLock::force(&self.text_types);
         LazyLock::force(&self.scales);
@@ -228,6 +233,7 @@ impl Knowledge {
             statistics: table!(StatisticsPlaces::embedded),
             tokenizer_parts: table!(TokenizerPart::embedded),
             tokenizers: table!(TokenizerClasses::embedded),
+            generation: table!(GenerationTable::embedded),
             matrices: table!(Matrices::embedded),
             text_types: table!(TextTypes::embedded),
             scales: table!(Scales::embedded),

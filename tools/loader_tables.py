@@ -14,7 +14,7 @@ import sys
 import torch  # noqa: F401
 import transformers  # noqa: F401
 
-TOOLS = ("names", "classes", "modules", "ropes", "parts", "tokenizers", "text_classes", "matrices")
+TOOLS = ("names", "classes", "modules", "ropes", "parts", "tokenizers", "text_classes", "matrices", "generation")
 
 
 def forked(tool):

@@ -19,7 +19,7 @@ use super::outcome::Outcome;
 use super::tokens::{OpenedTokenizer, Unopened};
 use super::variables::{self, declared};
 use super::verdict::{Basis, ObjectVerdict, PredictedLoad, is_program};
-use super::view::{AdapterFit, Asked, FilesView, VersionsView};
+use super::view::{Asked, FilesView, JudgedObject, VersionsView};
 use super::{directory, index, inspect, judge, policy, processor, robots, sub_configs, tokens};
 use crate::checkpoint::{Checkpoint, Fault, FaultKind};
 use crate::knowledge::embeddings::TokenEmbedding;
@@ -112,8 +112,8 @@ struct LoaderView<'a> {
     opened: Option<Rc<OpenedTokenizer>>,
     /// For each loader without a predicted load, the reason.
     unpredicted: Vec<(&'static str, String)>,
-    /// For each version, whether the adapter was compared with its base model.
-    adapter: Vec<AdapterFit>,
+    /// For each version, the objects beside the model that were judged.
+    objects: Vec<JudgedObject>,
     outcome: Outcome,
 }
 
@@ -293,8 +293,8 @@ impl<'a> CheckFacts<'a> {
         scope.bind("program", &program.into());
         outcome.loads.iter_mut().for_each(LoadReport::shorten);
         let context = Context::new(checkpoint, targets, self.programs, &outcome.loads);
-        let adapter = observed.adapter;
-        LoaderView { context, scope, faults, opened, unpredicted: judged.unpredicted, adapter, outcome }
+        let objects = observed.objects;
+        LoaderView { context, scope, faults, opened, unpredicted: judged.unpredicted, objects, outcome }
     }
 
     /// The checkpoint as programs other than transformers are judged by; `None` when the run asks for none.
@@ -356,7 +356,7 @@ impl<'a> CheckFacts<'a> {
 
     /// The verdicts on the loaders of a reading and on programs, by all rules. Rules that `unmet` covers are not run again.
     fn judged(&self, reading: &LoaderView<'_>, unmet: &Unmet<'_>, programs: &[AskedProgram<'_>]) -> Vec<PredictedLoad> {
-        let LoaderView { context, scope, faults, unpredicted, adapter, outcome, .. } = reading;
+        let LoaderView { context, scope, faults, unpredicted, objects, outcome, .. } = reading;
         let differing = reading.differences(unmet.reading);
         let mut outcome = outcome.clone();
         // A rule without effects says nothing of a load.
@@ -375,7 +375,7 @@ impl<'a> CheckFacts<'a> {
             has_processor: architecture.is_some_and(|class| self.knowledge.processor_of(class).is_some()),
             not_judged: not_judged.as_deref(),
             unpredicted,
-            adapter,
+            objects,
         };
         basis.verdicts(&context.targets, programs)
     }

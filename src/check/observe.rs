@@ -7,8 +7,8 @@
 
 use super::view::{ExplainingFacts, FilesView, Observation, VersionsView};
 use super::{
-    adapter, built_tokenizer, card, class_names, directory, finite, index, model_type, module_imports, modules,
-    pickles, processor, programs, refusals, ropes, statistics, templates, tokenizer_json, tokens,
+    adapter, built_tokenizer, card, class_names, directory, finite, generation, index, model_type, module_imports,
+    modules, pickles, processor, programs, refusals, ropes, statistics, templates, tokenizer_json, tokens,
 };
 use crate::checkpoint::Fault;
 
@@ -49,6 +49,7 @@ const OF_VERSIONS: &[VersionsObserver] = &[
     |view| ropes::faults(view.checkpoint, view.knowledge, view.asked.targets).into(),
     |view| processor::faults(view).into(),
     adapter::fit::observe,
+    generation::observe,
 ];
 
 /// Explainers of all faults.
@@ -102,7 +103,7 @@ fn run<O>(table: &[O], order: RunOrder, observe: impl Fn(&O) -> Observation) -> 
     observed.into_iter().flatten().fold(Observation::default(), |mut all, one| {
         all.faults.extend(one.faults);
         all.facts.refused.extend(one.facts.refused);
-        all.adapter.extend(one.adapter);
+        all.objects.extend(one.objects);
         all.facts.directory = all.facts.directory.or(one.facts.directory);
         all
     })

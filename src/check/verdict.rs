@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use super::finding::{Finding, FindingEffect};
 use super::index;
 use super::load::{LoadReport, Mismatch, SilentReason, Target, version};
-use super::view::AdapterFit;
+use super::view::JudgedObject;
 use crate::checkpoint::{Checkpoint, NotRead, untold};
 use crate::knowledge::program::AskedProgram;
 use crate::knowledge::rule::{Consequence, Object};
@@ -142,8 +142,8 @@ pub(super) struct Basis<'a> {
     pub(super) not_judged: Option<&'a str>,
     /// For a loader without a report, the reason.
     pub(super) unpredicted: &'a [(&'static str, String)],
-    /// For each version, whether the adapter was compared with its base model.
-    pub(super) adapter: &'a [AdapterFit],
+    /// For each version, the objects beside the model that were judged.
+    pub(super) objects: &'a [JudgedObject],
 }
 
 impl Basis<'_> {
@@ -273,14 +273,14 @@ impl Basis<'_> {
         };
         if object != Object::Model || is_program(loader) {
             let known = || (LoadVerdict::NotPredicted, Some("only known faults are looked for".to_owned()));
-            let fit = self.adapter.iter().find(|fit| object == Object::Adapter && fit.loader == loader);
-            let compared = fit.map(|fit| match &fit.not_compared {
+            let judged = self.objects.iter().find(|judged| (judged.object, judged.loader) == (object, loader));
+            let alone = judged.map(|judged| match &judged.not_judged {
                 Some(why) => (LoadVerdict::NotPredicted, Some(why.clone())),
                 None => (LoadVerdict::Loads, None),
             });
             return not_read()
-                .or_else(|| self.not_understood().filter(|_| fit.is_some()))
-                .or(compared)
+                .or_else(|| self.not_understood().filter(|_| object == Object::Adapter && judged.is_some()))
+                .or(alone)
                 .unwrap_or_else(known);
         }
         if self.checkpoint.config().is_none() {

@@ -5,6 +5,7 @@ use std::collections::BTreeSet;
 use serde_json::Value;
 
 use super::load::{LoadReport, Target};
+use crate::checkpoint::files::Object;
 use crate::checkpoint::{Checkpoint, Fault};
 use crate::knowledge::names::{LoaderNames, NameKind};
 use crate::knowledge::processor::Processor;
@@ -75,13 +76,15 @@ pub(super) struct ExplainingFacts {
     pub(super) refused: BTreeSet<String>,
 }
 
-/// Whether an adapter was compared with its base model under a version.
+/// Whether an object beside the model was judged under a version.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct AdapterFit {
+pub(super) struct JudgedObject {
+    /// The object.
+    pub(super) object: Object,
     /// The version.
     pub(super) loader: &'static str,
-    /// Why the adapter was not compared; `None` where it was, and faults tell what does not fit.
-    pub(super) not_compared: Option<String>,
+    /// Why it was not judged; `None` where it was, and faults tell what does not fit.
+    pub(super) not_judged: Option<String>,
 }
 
 /// The result of an observer.
@@ -89,8 +92,8 @@ pub(super) struct AdapterFit {
 pub(super) struct Observation {
     pub(super) faults: Vec<Fault>,
     pub(super) facts: ExplainingFacts,
-    /// For each version, whether the adapter was compared with its base model.
-    pub(super) adapter: Vec<AdapterFit>,
+    /// For each version, the objects beside the model that were judged.
+    pub(super) objects: Vec<JudgedObject>,
 }
 
 impl<F: IntoIterator<Item = Fault>> From<F> for Observation {

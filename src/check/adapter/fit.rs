@@ -13,8 +13,9 @@ use super::targets::Targets;
 use crate::check::config_pattern::JUDGEMENTS;
 use crate::check::load::{self, AdaptedNames, Stored, Target};
 use crate::check::model_type::has_code;
-use crate::check::view::{AdapterFit, Observation, VersionsView};
+use crate::check::view::{JudgedObject, Observation, VersionsView};
 use crate::checkpoint::adapter::{Adapter, AdapterBase, PREFIX};
+use crate::checkpoint::files::Object;
 use crate::checkpoint::{Checkpoint, Fault, FaultKind, Place, Tensor, escape, files};
 use crate::knowledge::matrices::MatrixModule;
 use crate::knowledge::quantization::stated;
@@ -55,7 +56,7 @@ pub(in crate::check) fn observe(view: &VersionsView<'_>) -> Observation {
         });
         let loader = target.loader.version();
         let stored = || base.as_ref().ok().zip(adapter.tensors()).map(|(base, tensors)| faults(base, tensors));
-        let (not_compared, misfits) = match compared {
+        let (not_judged, misfits) = match compared {
             // Whoever trains new tokens resizes the base model before, as `AutoPeftModel` does for the adapter's tokenizer.
             Ok(faults) => (faults.iter().any(has_other_rows).then(|| OTHER_ROWS.to_owned()), faults),
             Err(why) => (Some(why), stored().unwrap_or_default()),
@@ -64,13 +65,13 @@ pub(in crate::check) fn observe(view: &VersionsView<'_>) -> Observation {
             Some((_, loaders)) => loaders.push(loader),
             None => found.push((misfits, vec![loader])),
         }
-        fits.push(AdapterFit { loader, not_compared });
+        fits.push(JudgedObject { object: Object::Adapter, loader, not_judged });
     }
     let under = |(faults, loaders): (Vec<Fault>, Vec<&'static str>)| {
         faults.into_iter().map(move |fault| fault.under_all(loaders.iter().copied()))
     };
     let found: Vec<Fault> = found.into_iter().flat_map(under).collect();
-    Observation { faults: found, adapter: fits, ..Observation::default() }
+    Observation { faults: found, objects: fits, ..Observation::default() }
 }
 
 /// Whether a fault is that of a matrix with another number of token rows.

@@ -94,11 +94,12 @@ fn tags(text: &str) -> impl Iterator<Item = Tag<'_>> {
     std::iter::from_fn(move || {
         loop {
             let (_, opened) = rest.split_at(rest.find('{')?);
-            let Some(end) = close_of(opened) else {
+            if !["{{", "{%", "{#"].iter().any(|open| opened.starts_with(open)) {
                 rest = opened.get(1..).unwrap_or_default();
                 continue;
-            };
-            let (found, after) = opened.split_at(end);
+            }
+            // Without an end nothing parses, and nothing is run.
+            let (found, after) = opened.split_at(close_of(opened)?);
             rest = after;
             if !found.starts_with("{#") {
                 return Some(Tag::of(found));
@@ -107,7 +108,7 @@ fn tags(text: &str) -> impl Iterator<Item = Tag<'_>> {
     })
 }
 
-/// Where a tag that begins here ends; `None` for a brace that begins none, or one without an end, which does not parse.
+/// Where a tag that begins here ends; `None` for one without an end.
 fn close_of(text: &str) -> Option<usize> {
     let close = match text.as_bytes().get(1)? {
         b'{' => "}}",

@@ -18,14 +18,14 @@ struct Case {
     findings: Vec<Finding>,
     loads: Vec<LoadReport>,
     has_processor: bool,
-    adapter: Vec<AdapterFit>,
+    objects: Vec<JudgedObject>,
 }
 
 impl Case {
     fn new() -> Self {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/donors/spatialvla-tiny");
         let checkpoint = Checkpoint::open(&path).unwrap();
-        Self { checkpoint, findings: Vec::new(), loads: Vec::new(), has_processor: false, adapter: Vec::new() }
+        Self { checkpoint, findings: Vec::new(), loads: Vec::new(), has_processor: false, objects: Vec::new() }
     }
 
     fn finding(mut self, code: &str, effects: &[(Object, &str, Consequence, &str)]) -> Self {
@@ -76,7 +76,7 @@ impl Case {
             has_processor: self.has_processor,
             not_judged: None,
             unpredicted: &[],
-            adapter: &self.adapter,
+            objects: &self.objects,
         }
     }
 
@@ -264,7 +264,11 @@ fn the_worst_known_verdict_of_an_object_is_that_of_the_directory() {
 fn an_adapter_loads_where_it_was_compared_and_read() {
     let fit = |loader: &'static str, not_compared: Option<&str>| {
         let mut case = Case::new();
-        case.adapter.push(AdapterFit { loader, not_compared: not_compared.map(str::to_owned) });
+        case.objects.push(JudgedObject {
+            object: Object::Adapter,
+            loader,
+            not_judged: not_compared.map(str::to_owned),
+        });
         case
     };
     let unknown = |why: &str| found(LoadVerdict::NotPredicted, why, &[]);

@@ -13,9 +13,9 @@ use crate::knowledge::{Architecture, Evidence, Expected};
 /// thousands of tensors.
 const BUDGET: usize = 3_000_000;
 /// The same for the values that explain a report, in every check.
-const EXPLAINING: usize = 500_000;
+const EXPLAINING: usize = 400_000;
 /// What is added to it for each stored tensor.
-const EXPLAINING_EACH: usize = 25;
+const EXPLAINING_EACH: usize = 12;
 /// Fixed cost of a build, in tensors.
 const OVERHEAD: usize = 40;
 /// Values of a config above which each costs as much as this many more, because a search copies them for every candidate. A

@@ -237,6 +237,9 @@ fault_kinds! {
         },
         EightBitFloats = "eight-bit-floats" { count: Integer, dtype: Text, kept: List(&Text) },
         EmptyTensors = "empty-tensors" { count: Integer, names: List(&Text), under?: Text, unmet?: Flag },
+        GenerationValueRefused = "generation-value-refused" {
+            key: Text, value: Any, because: Text, raises: Text, similar?: Text, generates: Flag,
+        },
         IndexEntryNotAShard = "index-entry-not-a-shard" { named: Text, tensors: Integer, pickle: Flag },
         IndexKeyNowhere = "index-key-nowhere" { said: Text },
         IndexMissing = "index-missing" { shards: Integer, index: Text },
@@ -322,6 +325,7 @@ fault_kinds! {
             given: Flag, unwritable: Flag, at: Text, key: Text, keys: List(&Text), read: Any, needed: Any,
             values: List(&Record(declared_keys! { key: Text, pointer: Text, needed: Any, read: Any, given: Flag })),
         },
+        SequencesRefused = "sequences-refused" { sequences: Any, beams: Any, raises: Text, generates: Flag },
         ShardMissing = "shard-missing" { shard: Text, tensors: OrNull(&Integer) },
         ShardNameDiffersInCase = "shard-name-differs-in-case" {
             similar: Text, by: Text, shard: Text, tensors: OrNull(&Integer),

@@ -1,0 +1,226 @@
+#!/usr/bin/env python3
+"""Generation configs with drawn values: what `check` says of them, and what GenerationConfig does.
+
+    generation.py FOLDER... [--count N] [--seed S] [--corpus DIRECTORY] [--list] [--keep DIRECTORY]
+
+Each FOLDER has one version of transformers, for the Python that runs this. The documents are those that its model classes have of
+themselves; `--corpus` adds the files below a directory whose names end with generation_config.json. Most of the N documents for
+each version have changes: values of other kinds, keys of the class and arguments of generate() with drawn values, keys of other
+documents, keys that are lost, and damaged bytes. `check --for` that version says `raises`, `loads wrong`, `loads` or `not
+predicted` of the generation config and of the model beside it. GenerationConfig.from_pretrained and from_pretrained of the model raise, or do not.
+
+`loads` where the class raises is a false clean, `raises` where it loads is a false raise.
+"""
+
+import argparse
+import collections
+import inspect
+import json
+import os
+import random
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from fresh import version_in
+from peer import Tally, check, workplace
+
+FILE = "generation_config.json"
+LIMITS = {"false clean": 0.01, "false raise": 0.01}
+SHARES = {"generation": 0.95, "model": 0.95}
+BATCH = 400
+VALUES = [None, True, False, 0, 1, 2, 4, 7, -1, 0.0, 1.0, 0.6, 1.5, -0.5, 2.0, "", "x", "never", "static", "hybrid", "auto", [], [1], [5, 6],
+          [[5]], ["x"], [0, "x"], {}, {"x": 1}, {"1": 0.5}, 50256, 10**12, 1e30]  # fmt: skip
+RELATED = ["num_beams", "num_beam_groups", "do_sample", "num_return_sequences", "diversity_penalty", "suppress_tokens",
+           "forced_eos_token_id", "forced_bos_token_id", "force_words_ids", "constraints", "cache_implementation", "use_cache"]  # fmt: skip
+
+
+# One version.
+
+
+def own_documents():
+    """Generation configs that the classes of this version have of themselves."""
+    import transformers
+    from transformers import GenerationConfig
+    from transformers.models.auto import modeling_auto
+
+    found = {}
+    for name in ("AutoModelForCausalLM", "AutoModelForSeq2SeqLM", "AutoModelForSpeechSeq2Seq", "AutoModelForImageTextToText"):
+        mapping = getattr(modeling_auto, name)._model_mapping
+        for config_class in mapping:
+            try:
+                config = GenerationConfig.from_model_config(config_class())
+                found[json.dumps(config.to_diff_dict(), sort_keys=True, default=str)] = config.to_diff_dict()
+            except Exception:  # a config without defaults
+                continue
+    assert transformers.__version__
+    return [json.loads(text) for text in sorted(found)]
+
+
+def drawn(rng, documents, keys):
+    """The bytes of a document, and what was done to it."""
+    document = dict(rng.choice(documents))
+    done = []
+    for _ in range(rng.choice([0, 1, 1, 1, 2, 2, 3, 5])):
+        how = rng.random()
+        if how < 0.25 and document:
+            key = rng.choice(sorted(document))
+            document[key] = rng.choice(VALUES)
+        elif how < 0.5:
+            key = rng.choice(keys)
+            document[key] = rng.choice(VALUES)
+        elif how < 0.75:
+            key = rng.choice(RELATED)
+            document[key] = rng.choice([True, False, None, 0, 1, 2, 3, 4, 0.5, 0.0, [5], [5, 6], "static"])
+        elif how < 0.9:
+            other = rng.choice(documents)
+            key = rng.choice(sorted(other) or ["eos_token_id"])
+            document[key] = other.get(key)
+        else:
+            key = rng.choice(sorted(document) or ["eos_token_id"])
+            document.pop(key, None)
+        done.append(f"{key}={json.dumps(document.get(key))[:40]}")
+    text = json.dumps(document, indent=rng.choice([None, 2]))
+    if rng.random() < 0.06:
+        at = rng.randrange(len(text))
+        how = rng.choice(["cut", "comma", "comment", "nan", "list", "bom", "latin", "double"])
+        done.append(how)
+        text = {
+            "cut": text[:at],
+            "comma": text.rstrip().removesuffix("}") + ",}",
+            "comment": "// made by hand\n" + text,
+            "nan": text.replace("{", '{"temperature": NaN, ', 1),
+            "list": f"[{text}]",
+            "bom": "\ufeff" + text,
+            "latin": text.replace("{", '{"\udce9": 1,', 1),
+            "double": text + text,
+        }[how]
+    return text.encode("utf-8", "surrogateescape"), ", ".join(done)
+
+
+def happened(read):
+    try:
+        read()
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"[:200]
+    return None
+
+
+def small_model(folder):
+    from transformers import LlamaConfig, LlamaForCausalLM
+
+    config = LlamaConfig(vocab_size=60000, hidden_size=8, intermediate_size=8, num_attention_heads=2, num_hidden_layers=1)
+    LlamaForCausalLM(config).save_pretrained(folder)
+    (folder / FILE).unlink(missing_ok=True)
+
+
+def worker(work, seed, count, corpus):
+    """Under one version: makes documents, and writes what the class does with each."""
+    import warnings
+
+    import transformers
+    from transformers import GenerationConfig, LlamaForCausalLM
+
+    warnings.simplefilter("ignore")
+    transformers.utils.logging.set_verbosity(transformers.utils.logging.CRITICAL)
+    work = Path(work)
+    model = work / "model"
+    small_model(model)
+    documents = own_documents()
+    files = sorted(Path(corpus).rglob("*generation_config.json")) if corpus != "-" else []
+    for file in files:
+        try:
+            document = json.loads(file.read_bytes())
+        except ValueError:
+            continue
+        documents += [document] if isinstance(document, dict) else []
+    keys = sorted({key for d in documents for key in d} | set(vars(GenerationConfig())) | set(arguments(GenerationConfig)))
+    with open(work / "told.partial", "w") as out:
+        for number in range(len(files) + int(count)):
+            rng = random.Random(f"{seed} {transformers.__version__} {number}")
+            folder = work / f"g-{number}"
+            folder.mkdir()
+            for file in model.iterdir():
+                (folder / file.name).symlink_to(file) if file.suffix != ".json" else os.link(file, folder / file.name)
+            text, done = (files[number].read_bytes(), "as published") if number < len(files) else drawn(rng, documents, keys)
+            (folder / FILE).write_bytes(text)
+            told = {"folder": str(folder), "done": done, "generation": happened(lambda: GenerationConfig.from_pretrained(folder))}
+            told["model"] = happened(lambda: LlamaForCausalLM.from_pretrained(folder)) if number % 10 == 0 else "not tried"
+            out.write(json.dumps(told) + "\n")
+    (work / "told.partial").rename(work / "told.jsonl")
+
+
+def arguments(cls):
+    """Arguments of generate(), and names of the class."""
+    from transformers.generation import GenerationMixin
+
+    return [*inspect.signature(GenerationMixin.generate).parameters, *(name for name in dir(cls) if not name.startswith("_"))]
+
+
+# All versions.
+
+
+def run_worker(folder, work, a):
+    version = version_in(folder)
+    place = work / version
+    if not (place / "told.jsonl").exists():
+        place.mkdir(parents=True, exist_ok=True)
+        env = {**os.environ, "PYTHONPATH": folder, "TRANSFORMERS_VERBOSITY": "critical", "CUDA_VISIBLE_DEVICES": ""}
+        subprocess.run([sys.executable, __file__, "--worker", place, a.seed, str(a.count), a.corpus or "-"], env=env, check=True)
+    return version, [json.loads(line) for line in (place / "told.jsonl").read_text().splitlines()]
+
+
+def judge(tally, a, version, told):
+    counts = {"generation": collections.Counter(), "model": collections.Counter()}
+    for at in range(0, len(told), BATCH):
+        batch = told[at : at + BATCH]
+        entries = check("--for", f"transformers=={version}", "--follow-links", str(Path(batch[0]["folder"]).parent), *(t["folder"] for t in batch))[0]
+        for one in batch:
+            load = next(load for load in entries[os.path.realpath(one["folder"])]["loads"] if load["loader"] == version)
+            for kind, of in counts.items():
+                actual = one[kind]
+                if actual == "not tried":
+                    continue
+                said = next((o for o in load["objects"] if o["object"] == kind), {"verdict": "none"})
+                of[outcome := compared(said["verdict"], actual)] += 1
+                if a.list and outcome != "right":
+                    why = said.get("why") or ", ".join(said.get("findings", []))
+                    print(f"{outcome}: {version} {kind} {one['folder']} [{one['done']}]: said {said['verdict']} ({why}); {actual}"[:500])
+    for kind, of in counts.items():
+        total, judged = sum(of.values()), sum(of.values()) - of["not predicted"]
+        print(f"{version}: {total} of {kind}, {dict(sorted(of.items()))}", flush=True)
+        for outcome, limit in LIMITS.items():
+            tally.expect(of[outcome] <= max(1, limit * judged), f"{version}: {of[outcome]} of {judged} {outcome} of {kind}")
+        tally.expect(judged >= SHARES[kind] * total, f"{version}: {judged} of {total} are predicted of {kind}")
+
+
+def compared(said, actual):
+    if said in ("not-predicted", "none"):
+        return "not predicted"
+    if (said == "raises") == (actual is not None):
+        return "right"
+    return "false clean" if actual is not None else "false raise"
+
+
+def main():
+    if sys.argv[1:2] == ["--worker"]:
+        return worker(*sys.argv[2:])
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("folder", nargs="+")
+    p.add_argument("--count", type=int, default=500, help="for each version")
+    p.add_argument("--seed", default="1")
+    p.add_argument("--corpus", help="a directory with published files")
+    p.add_argument("--list", action="store_true", help="print every verdict that is not right")
+    p.add_argument("--keep", type=Path)
+    a = p.parse_args()
+    tally = Tally()
+    with workplace() as temporary, ThreadPoolExecutor(2) as pool:
+        work = a.keep or temporary
+        for version, told in pool.map(lambda folder: run_worker(folder, work, a), a.folder):
+            judge(tally, a, version, told)
+    tally.finish()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
