@@ -3,6 +3,7 @@
 
 mod expressions;
 pub mod failure_modes;
+mod generation;
 mod lets;
 mod memory;
 mod names;

@@ -510,6 +510,10 @@ def measured(directory):
     return status, usage.ru_utime + usage.ru_stime, usage.ru_maxrss << 10
 
 
+def allowed_for(size):
+    return SECONDS + size / BYTES_PER_SECOND
+
+
 def one(case):
     seed, kind, number, place = case
     rng = random.Random(f"{seed}/{kind}/{number}")
@@ -520,6 +524,11 @@ def one(case):
         KINDS[kind](rng, directory, budget)
         size = sum(file.stat().st_size for file in directory.rglob("*") if file.is_file())
         status, seconds, memory = measured(directory)
+        # What else runs on a processor makes a program slower, never faster: the fastest of four runs counts.
+        for _ in range(3):
+            if seconds > allowed_for(size):
+                status, again, memory = measured(directory)
+                seconds = min(seconds, again)
     finally:
         if not os.environ.get("KEEP"):
             shutil.rmtree(directory)
@@ -539,7 +548,7 @@ def main():
         numbers = range(options.first, options.first + options.count)
         cases = [(options.seed, kinds[number % len(kinds)], number, place) for number in numbers]
         for kind, number, size, status, seconds, memory in pool.map(one, cases, chunksize=8):
-            allowed = SECONDS + size / BYTES_PER_SECOND
+            allowed = allowed_for(size)
             what = f"{kind} {number}: {size} bytes, status {status}, {seconds:.2f} s of {allowed:.2f}, {memory >> 20} MiB"
             tally.expect(os.WIFEXITED(status) and seconds <= allowed and memory <= MEMORY, what)
             most = worst[kind]
