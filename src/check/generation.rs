@@ -34,6 +34,16 @@ enum Related {
 pub(super) fn observe(view: &VersionsView<'_>) -> Observation {
     let VersionsView { checkpoint, knowledge, asked, .. } = *view;
     let Some(document) = checkpoint.document(files::GENERATION_CONFIG) else { return Observation::default() };
+    // Any other fault of the text is an `OSError`: the class sees no values then.
+    let is_python = |fault: &Fault| {
+        matches!(
+            fault.kind,
+            FaultKind::NonFiniteNumber | FaultKind::HugeNumber | FaultKind::DuplicateJsonKey | FaultKind::LoneSurrogate
+        )
+    };
+    if !document.faults.iter().all(is_python) {
+        return Observation::default();
+    }
     let Some(given) = document.value.as_ref().and_then(Value::as_object) else { return Observation::default() };
     let config = checkpoint.config().filter(|config| is_model(checkpoint) && !has_code(config));
     let mut faults = Vec::new();
@@ -223,6 +233,8 @@ impl<'g> Given<'g> {
                 short(self.value("num_beams"))
             )),
             (Some(_), Some(_)) => None,
+            // Python compares two lists, and two texts.
+            (None, None) => return Related::Unknown("num_return_sequences"),
             _ => Some(TYPE_ERROR.to_owned()),
         };
         raises.map_or(Related::Fits, |raises| {

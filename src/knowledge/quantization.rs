@@ -21,10 +21,10 @@ pub use stated::stated;
 
 /// A quantisation scheme, as read from its file in `rules/quantization/`.
 ///
-/// Expressions see `config`, `q` (its quantisation block) and the parameters. Shapes also see the plain tensor: `rows` and
-/// `cols` (its last two dimensions), `lead` (the dimensions before them), `count` (the number of its values), and the names
-/// in `let`. `held` lists the stored names of a module. `init(list)` is a list without its last element, `last(list)` that
-/// element.
+/// Expressions see `q` (the quantisation block of the config), `is_mlx` (whether the config has one under `quantization`, as MLX
+/// writes it) and the parameters. Shapes also see the plain tensor: `rows` and `cols` (its last two dimensions), `lead` (the
+/// dimensions before them), `count` (the number of its values), and the names in `let`. `held` lists the stored names of a
+/// module. `init(list)` is a list without its last element, `last(list)` that element.
 #[derive(Debug, Clone, Deserialize)]
 #[cfg_attr(test, derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]

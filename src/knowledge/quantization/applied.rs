@@ -13,7 +13,7 @@ pub struct AppliedScheme<'k> {
     scheme: &'k Scheme,
     block: Value,
     pointer: &'k str,
-    /// Binds `config`, `q` and the functions; parameters are bound in scopes inside it.
+    /// Binds `q` and the functions; parameters are bound in scopes inside it.
     scope: Scope<'static>,
     /// Values of the parameters, in the order of [`Scheme::parameters`].
     values: Vec<Value>,
@@ -24,7 +24,6 @@ impl<'k> AppliedScheme<'k> {
         // MLX writes two equal blocks; only the older one, `quantization`, contains parameters of single modules.
         let block = if scheme.overrides { config.get("quantization").unwrap_or(block) } else { block }.clone();
         let mut scope = Scope::new();
-        scope.bind("config", config);
         scope.bind("q", &block);
         scope.function("init", |arguments| match arguments {
             [Value::Array(items)] => {

@@ -50,7 +50,7 @@ fn scheme_of<'k>(
     (pointer, block): (&'k str, &Value),
 ) -> DeclaredScheme<'k> {
     let mut scope = Scope::new();
-    scope.bind("config", config);
+    scope.bind("is_mlx", &config.get("quantization").is_some_and(|block| !block.is_null()).into());
     scope.bind("q", block);
     let meant = |scheme: &&Scheme| scheme.when.eval_bool(&scope).unwrap_or(false);
     match schemes.iter().find(meant) {

@@ -57,6 +57,7 @@ fn a_generation_config_loads_as_its_version_reads_it() {
         (r#"{ "max_new_tokens": NaN }"#, [NotPredicted, NotPredicted, NotPredicted]),
         (r#"{ "temperature": NaN }"#, [Loads, Loads, Loads]),
         (r#"{ "watermarking_config": {} }"#, [Loads, Loads, Loads]),
+        (r#"{ "num_return_sequences": [1], "num_beams": [2] }"#, [NotPredicted, NotPredicted, Raises]),
     ] {
         for (version, verdict) in ["4.47.0", "4.57.6", "5.23.0"].into_iter().zip(verdicts) {
             let (generation_verdict, model, pointers) = judged(generation, "LlamaForCausalLM", version);
