@@ -236,6 +236,17 @@ pub fn details(finding: &Finding) -> Vec<String> {
     finding.details.iter().map(|detail| sentence(detail)).collect()
 }
 
+/// What a checkpoint is, for its header: the architecture of its class, or an adapter. The name of an architecture is escaped by
+/// `escaped`.
+pub fn kind(checkpoint: &CheckpointReport, escaped: impl Fn(&str) -> String) -> String {
+    let offers = |object| checkpoint.loads.iter().flat_map(|load| &load.objects).any(|one| one.object == object);
+    match &checkpoint.architecture {
+        Some(architecture) => escaped(architecture),
+        None if offers(Object::Adapter) && !offers(Object::Model) => "adapter".to_owned(),
+        None => "unknown architecture".to_owned(),
+    }
+}
+
 /// The findings for the header of a checkpoint, one line each: `info[ARC001]: unknown class …`.
 pub fn notes(checkpoint: &CheckpointReport) -> Vec<String> {
     let notes = checkpoint.findings.iter().filter(|finding| finding.is_note());

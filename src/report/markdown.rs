@@ -66,13 +66,13 @@ fn section(out: &mut String, checkpoint: &CheckpointReport, cap: usize) {
         Some(role) => text(&role.to_string()),
         None => code(&name(&checkpoint.path)),
     };
-    let architecture = checkpoint.architecture.as_deref().map_or_else(|| "unknown architecture".to_owned(), text_name);
+    let kind = format::kind(checkpoint, text_name);
     let verdict = checkpoint.verdict.name();
     let _ok = writeln!(out, "\n## {title}: {verdict}");
     if !checkpoint.loads.is_empty() {
         let _ok = writeln!(out, "\nVerdict: {}", text(&format::headline(&checkpoint.loads)));
     }
-    let _ok = writeln!(out, "\n{architecture}, {}, {}", plural(checkpoint.tensors, "tensor"), bytes(checkpoint.bytes));
+    let _ok = writeln!(out, "\n{kind}, {}, {}", plural(checkpoint.tensors, "tensor"), bytes(checkpoint.bytes));
     let mut objects = format::objects(&checkpoint.loads);
     objects.extend(format::notes(checkpoint));
     objects.extend(format::fixed(checkpoint));

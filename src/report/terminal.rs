@@ -11,8 +11,8 @@ use std::fmt::Write as _;
 
 use self::paint::Paint;
 use super::format::{
-    agreeing, alike, bytes, capped, counts, governed, headlines, name, notes, objects, plural, summary, worst_first,
-    wrap,
+    agreeing, alike, bytes, capped, counts, governed, headlines, kind, name, notes, objects, plural, summary,
+    worst_first, wrap,
 };
 use super::model::{CheckpointReport, Report};
 use super::overview::Overview;
@@ -95,8 +95,8 @@ fn header(out: &mut String, checkpoint: &CheckpointReport, style: Style) {
         let _ok = write!(out, ": {}", paint.strong(&first));
         let _ok = others.map(|others| write!(out, " {}", paint.quiet(&others)));
     }
-    let architecture = checkpoint.architecture.as_deref().map_or_else(|| "unknown architecture".to_owned(), name);
-    let _ok = write!(out, "\n  {architecture}, {}, {}", plural(checkpoint.tensors, "tensor"), bytes(checkpoint.bytes));
+    let kind = kind(checkpoint, name);
+    let _ok = write!(out, "\n  {kind}, {}, {}", plural(checkpoint.tensors, "tensor"), bytes(checkpoint.bytes));
     let found = counts(checkpoint.counts);
     let verdict = if found.is_empty() { "clean" } else { &found };
     let _ok = writeln!(out, ", {}", paint.verdict(checkpoint.verdict, verdict));

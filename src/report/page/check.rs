@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::super::collapse::{NameGroup, collapse};
 use super::super::format::{
-    self, agreeing, alike, bytes, capped, headline, more, name, notes, objects, plural, summary,
+    self, agreeing, alike, bytes, capped, headline, kind, more, name, notes, objects, plural, summary,
 };
 use super::super::inspect::count;
 use super::super::model::{CheckpointReport, Report, Verdict};
@@ -119,7 +119,7 @@ fn section(out: &mut String, checkpoint: &CheckpointReport, id: &str) {
     let _ok = writeln!(
         out,
         "<section id=\"{id}\"><h2>{title} <span class=\"badge {class}\">{word}</span></h2>\n<p>{}, {}, {}</p>",
-        checkpoint.architecture.as_deref().map_or_else(|| "unknown architecture".to_owned(), |a| text(&name(a))),
+        kind(checkpoint, |architecture| text(&name(architecture))),
         plural(checkpoint.tensors, "tensor"),
         bytes(checkpoint.bytes)
     );
