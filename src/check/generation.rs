@@ -1,4 +1,4 @@
-//! What `GenerationConfig.from_pretrained` does with generation_config.json.
+//! What `GenerationConfig.from_pretrained` does with `generation_config.json`.
 //!
 //! Source: `generation/configuration_utils.py` of transformers 4.47.0, 4.57.6 and 5.23.0. Kinds of values that are refused are
 //! derived by trying the class; the relations between keys are those of its method `validate`.
@@ -14,6 +14,14 @@ use crate::knowledge::source;
 
 /// The key of a file that was made from config.json: then the class keeps no keys that it does not read.
 const OF_MODEL: &str = "_from_model_config";
+
+/// The relations between keys, with the keys that each compares.
+const COMPARED: [(GenerationRelation, &[&str]); 4] = [
+    (GenerationRelation::Constraints, &["constraints", "force_words_ids", "num_beams", "do_sample", "num_beam_groups"]),
+    (GenerationRelation::Groups, &["num_beams", "num_beam_groups", "diversity_penalty", "do_sample"]),
+    (GenerationRelation::Sequences, &["num_return_sequences", "num_beams", "do_sample"]),
+    (GenerationRelation::Forced, &["suppress_tokens", "forced_bos_token_id", "forced_eos_token_id"]),
+];
 
 /// A value that the class refuses.
 struct RefusedValue {
@@ -154,25 +162,16 @@ struct Given<'g> {
 impl<'g> Given<'g> {
     /// The relations that the version has, with the keys that each compares.
     fn relations(&self) -> impl Iterator<Item = (&'static [&'static str], Related)> {
-        let all: [(GenerationRelation, &'static [&'static str], fn(&Self) -> Related); 4] = [
-            (
-                GenerationRelation::Constraints,
-                &["constraints", "force_words_ids", "num_beams", "do_sample", "num_beam_groups"],
-                Self::constraints,
-            ),
-            (
-                GenerationRelation::Groups,
-                &["num_beams", "num_beam_groups", "diversity_penalty", "do_sample"],
-                Self::groups,
-            ),
-            (GenerationRelation::Sequences, &["num_return_sequences", "num_beams", "do_sample"], Self::sequences),
-            (
-                GenerationRelation::Forced,
-                &["suppress_tokens", "forced_bos_token_id", "forced_eos_token_id"],
-                Self::forced,
-            ),
-        ];
-        all.into_iter().filter(|(has, ..)| self.keys.has(*has)).map(|(_, keys, related)| (keys, related(self)))
+        let own = COMPARED.iter().filter(|(relation, _)| self.keys.has(*relation));
+        own.map(|(relation, keys)| {
+            let related = match relation {
+                GenerationRelation::Constraints => self.constraints(),
+                GenerationRelation::Groups => self.groups(),
+                GenerationRelation::Forced => self.forced(),
+                _ => self.sequences(),
+            };
+            (*keys, related)
+        })
     }
 
     fn value(&self, key: &str) -> &'g Value {
@@ -244,6 +243,7 @@ impl<'g> Given<'g> {
     }
 
     /// Groups of beams, which transformers 4.57 has no more.
+    #[expect(clippy::float_cmp, reason = "as Python compares them")]
     fn groups(&self) -> Related {
         let related = || {
             // 4.47 takes null for one beam.
@@ -355,6 +355,7 @@ impl<'g> Given<'g> {
 const TYPE_ERROR: &str = "TypeError";
 
 /// Whether Python counts two plain values as equal: truth values are numbers.
+#[expect(clippy::float_cmp, reason = "as Python compares them")]
 fn is_equal(one: &Value, other: &Value) -> bool {
     let number = |value: &Value| value.as_bool().map(|flag| f64::from(u8::from(flag))).or_else(|| value.as_f64());
     match (number(one), number(other)) {

@@ -1,4 +1,4 @@
-//! What `GenerationConfig` does with the values of generation_config.json.
+//! What `GenerationConfig` does with the values of `generation_config.json`.
 
 use std::collections::{BTreeMap, BTreeSet};
 

@@ -145,7 +145,11 @@ def worker(work, seed, count, corpus):
                 (folder / file.name).symlink_to(file) if file.suffix != ".json" else os.link(file, folder / file.name)
             text, done = (files[number].read_bytes(), "as published") if number < len(files) else drawn(rng, documents, keys)
             (folder / FILE).write_bytes(text)
-            told = {"folder": str(folder), "done": done, "generation": happened(lambda: GenerationConfig.from_pretrained(folder))}
+            told = {
+                "folder": str(folder),
+                "done": done,
+                "generation": happened(lambda: GenerationConfig.from_pretrained(folder)),
+            }
             told["model"] = happened(lambda: LlamaForCausalLM.from_pretrained(folder)) if number % 10 == 0 else "not tried"
             out.write(json.dumps(told) + "\n")
     (work / "told.partial").rename(work / "told.jsonl")
@@ -167,7 +171,9 @@ def run_worker(folder, work, a):
     if not (place / "told.jsonl").exists():
         place.mkdir(parents=True, exist_ok=True)
         env = {**os.environ, "PYTHONPATH": folder, "TRANSFORMERS_VERBOSITY": "critical", "CUDA_VISIBLE_DEVICES": ""}
-        subprocess.run([sys.executable, __file__, "--worker", place, a.seed, str(a.count), a.corpus or "-"], env=env, check=True)
+        subprocess.run(
+            [sys.executable, __file__, "--worker", place, a.seed, str(a.count), a.corpus or "-"], env=env, check=True
+        )
     return version, [json.loads(line) for line in (place / "told.jsonl").read_text().splitlines()]
 
 
@@ -175,7 +181,13 @@ def judge(tally, a, version, told):
     counts = {"generation": collections.Counter(), "model": collections.Counter()}
     for at in range(0, len(told), BATCH):
         batch = told[at : at + BATCH]
-        entries = check("--for", f"transformers=={version}", "--follow-links", str(Path(batch[0]["folder"]).parent), *(t["folder"] for t in batch))[0]
+        entries = check(
+            "--for",
+            f"transformers=={version}",
+            "--follow-links",
+            str(Path(batch[0]["folder"]).parent),
+            *(t["folder"] for t in batch),
+        )[0]
         for one in batch:
             load = next(load for load in entries[os.path.realpath(one["folder"])]["loads"] if load["loader"] == version)
             for kind, of in counts.items():
@@ -186,7 +198,11 @@ def judge(tally, a, version, told):
                 of[outcome := compared(said["verdict"], actual)] += 1
                 if a.list and outcome != "right":
                     why = said.get("why") or ", ".join(said.get("findings", []))
-                    print(f"{outcome}: {version} {kind} {one['folder']} [{one['done']}]: said {said['verdict']} ({why}); {actual}"[:500])
+                    print(
+                        f"{outcome}: {version} {kind} {one['folder']} [{one['done']}]: said {said['verdict']} ({why}); {actual}"[
+                            :500
+                        ]
+                    )
     for kind, of in counts.items():
         total, judged = sum(of.values()), sum(of.values()) - of["not predicted"]
         print(f"{version}: {total} of {kind}, {dict(sorted(of.items()))}", flush=True)

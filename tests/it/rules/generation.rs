@@ -1,4 +1,4 @@
-//! What is said of generation_config.json, by version.
+//! What is said of `generation_config.json`, by version.
 
 use std::sync::Arc;
 
