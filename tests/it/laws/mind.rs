@@ -160,7 +160,10 @@ fn repaired(number: u64, grounds: &Grounds, knowledge: &Knowledge) -> Option<Vec
     let (case, made) = grounds.make(&mut draw, room.path(), knowledge)?;
     let changes = mutate(&made, false, grounds, &mut draw);
     let judge = |checkpoint: &Arc<Checkpoint>| check(checkpoint, knowledge);
-    let checkpoint = Arc::new(Checkpoint::open(&made).unwrap());
+    // As the directory is read below.
+    let mut checkpoint = Checkpoint::open(&made).unwrap();
+    checkpoint.expect_lfs_pointers(&|top| Some(top) == made.parent());
+    let checkpoint = Arc::new(checkpoint);
     let repair = plan(&checkpoint, judge(&checkpoint), draw.once_in(2), &judge);
     if repair.changes.is_empty() {
         return None;
