@@ -18,11 +18,11 @@ import inspect
 import json
 import os
 import random
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from differential import told_by
 from fresh import version_in
 from peer import Tally, check, workplace
 
@@ -41,7 +41,6 @@ RELATED = ["num_beams", "num_beam_groups", "do_sample", "num_return_sequences", 
 
 def own_documents():
     """Generation configs that the classes of this version have of themselves."""
-    import transformers
     from transformers import GenerationConfig
     from transformers.models.auto import modeling_auto
 
@@ -54,7 +53,6 @@ def own_documents():
                 found[json.dumps(config.to_diff_dict(), sort_keys=True, default=str)] = config.to_diff_dict()
             except Exception:  # a config without defaults
                 continue
-    assert transformers.__version__
     return [json.loads(text) for text in sorted(found)]
 
 
@@ -115,7 +113,7 @@ def small_model(folder):
     (folder / FILE).unlink(missing_ok=True)
 
 
-def worker(work, seed, count, corpus):
+def worker(_, work, seed, count, corpus):
     """Under one version: makes documents, and writes what the class does with each."""
     import warnings
 
@@ -166,15 +164,9 @@ def arguments(cls):
 
 
 def run_worker(folder, work, a):
+    """The documents of one version."""
     version = version_in(folder)
-    place = work / version
-    if not (place / "told.jsonl").exists():
-        place.mkdir(parents=True, exist_ok=True)
-        env = {**os.environ, "PYTHONPATH": folder, "TRANSFORMERS_VERBOSITY": "critical", "CUDA_VISIBLE_DEVICES": ""}
-        subprocess.run(
-            [sys.executable, __file__, "--worker", place, a.seed, str(a.count), a.corpus or "-"], env=env, check=True
-        )
-    return version, [json.loads(line) for line in (place / "told.jsonl").read_text().splitlines()]
+    return version, told_by(__file__, folder, work / version, a.seed, a.count, a.corpus or "-")
 
 
 def judge(tally, a, version, told):

@@ -430,7 +430,7 @@ KEYS = {
         "model_type", "num_hidden_layers", "pad_token_id", "quantization_config", "rope_parameters", "rope_scaling", "text_config",
         "torch_dtype", "transformers_version", "vision_config",
     ],
-    "generation_config.json": ["bad_words_ids", "eos_token_id", "suppress_tokens", "transformers_version"],
+    "generation_config.json": ["bad_words_ids", "eos_token_id", "forced_eos_token_id", "suppress_tokens", "transformers_version"],
     "model.safetensors.index.json": ["metadata", "weight_map"],
     "preprocessor_config.json": ["auto_map", "image_processor_type", "size"],
     "processor_config.json": ["auto_map", "chat_template", "processor_class"],

@@ -57,6 +57,8 @@ fn a_generation_config_loads_as_its_version_reads_it() {
         (r#"{ "max_new_tokens": NaN }"#, [NotPredicted, NotPredicted, NotPredicted]),
         (r#"{ "temperature": NaN }"#, [Loads, Loads, Loads]),
         (r#"{ "watermarking_config": {} }"#, [Loads, Loads, Loads]),
+        (r#"{ "num_beams": "4" }"#, [Loads, Loads, Loads]),
+        (r#"{ "num_beams": "4", "num_beam_groups": 2, "do_sample": true }"#, [Raises, Loads, Loads]),
         (r#"{ "num_return_sequences": [1], "num_beams": [2] }"#, [NotPredicted, NotPredicted, Raises]),
     ] {
         for (version, verdict) in ["4.47.0", "4.57.6", "5.23.0"].into_iter().zip(verdicts) {
@@ -66,6 +68,16 @@ fn a_generation_config_loads_as_its_version_reads_it() {
             assert_eq!(pointers.is_empty(), verdict != Raises, "{version}: {generation} {pointers:?}");
         }
     }
+}
+
+/// Lists are compared as sets: in no more work than their length.
+#[test]
+fn long_lists_of_tokens_are_compared() {
+    let ids: Vec<u64> = (0..30_000).collect();
+    let forced: Vec<u64> = ids.iter().rev().copied().collect();
+    let both = json!({ "suppress_tokens": ids, "forced_eos_token_id": forced }).to_string();
+    let (verdict, _, pointers) = judged(&both, "LlamaForCausalLM", "5.23.0");
+    assert_eq!((verdict, pointers), (Raises, vec!["/forced_eos_token_id".to_owned()]));
 }
 
 /// A class that cannot generate does not read the file; `GenerationConfig` refuses it all the same.
