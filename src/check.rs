@@ -42,6 +42,7 @@ mod statistics;
 mod sub_configs;
 mod suppressions;
 mod templates;
+mod tokenizer_config;
 mod tokenizer_json;
 pub mod tokens;
 pub mod variables;

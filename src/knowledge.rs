@@ -40,7 +40,9 @@ mod sorted;
 pub mod source;
 pub mod statistics;
 pub mod text_classes;
+pub mod tokenizer_config;
 pub mod tokenizer_parts;
+pub mod tokenizer_values;
 pub mod tokenizers;
 pub mod wrappers;
 
@@ -75,7 +77,9 @@ use scales::Scales;
 use source::DataError;
 use statistics::StatisticsPlaces;
 use text_classes::TextTypes;
+use tokenizer_config::TokenizerConfigTable;
 use tokenizer_parts::TokenizerPart;
+use tokenizer_values::TokenizerValues;
 use tokenizers::TokenizerClasses;
 use wrappers::Wrappers;
 
@@ -136,6 +140,10 @@ pub struct Knowledge {
     pub statistics: Table<StatisticsPlaces>,
     /// Parts of tokenizer.json.
     pub tokenizer_parts: Table<Vec<TokenizerPart>>,
+    /// Values of `tokenizer_config.json` that classes refuse.
+    pub tokenizer_configs: Table<TokenizerConfigTable>,
+    /// Values of tokenizer.json that the library refuses.
+    pub tokenizer_values: Table<TokenizerValues>,
     /// Tokenizer classes that do not open tokenizer.json as it is.
     pub tokenizers: Table<TokenizerClasses>,
     /// What `GenerationConfig` does with values.
@@ -191,6 +199,8 @@ impl Knowledge {
         LazyLock::force(&self.directories);
         LazyLock::force(&self.statistics);
         LazyLock::force(&self.tokenizer_parts);
+        LazyLock::force(&self.tokenizer_configs);
+        LazyLock::force(&self.tokenizer_values);
         LazyLock::force(&self.tokenizers);
         LazyLock::force(&self.generation);
         LazyLock::force(&self.matrices);
@@ -232,6 +242,8 @@ impl Knowledge {
             directories: table!(Directories::embedded),
             statistics: table!(StatisticsPlaces::embedded),
             tokenizer_parts: table!(TokenizerPart::embedded),
+            tokenizer_configs: table!(TokenizerConfigTable::embedded),
+            tokenizer_values: table!(TokenizerValues::embedded),
             tokenizers: table!(TokenizerClasses::embedded),
             generation: table!(GenerationTable::embedded),
             matrices: table!(Matrices::embedded),

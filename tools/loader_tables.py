@@ -14,7 +14,8 @@ import sys
 import torch  # noqa: F401
 import transformers  # noqa: F401
 
-TOOLS = ("names", "classes", "modules", "ropes", "parts", "tokenizers", "text_classes", "matrices", "generation")
+TOOLS = ("names", "classes", "modules", "ropes", "parts", "tokenizers", "text_classes", "matrices", "generation",
+         "tokenizer_config", "tokenizer_values")  # fmt: skip
 
 
 def forked(tool):

@@ -89,10 +89,13 @@ def document(kind, special, with_processor=True):
     }
 
 
-def opened(cls, name, kind, special, named, with_processor=True):
-    """The tokenizer that the class opens, or the exception."""
+def opened(cls, name, kind, special, named, with_processor=True, is_sequence=False):
+    """The tokenizer that the class opens, or the exception. `is_sequence` is for classes that demand a sequence."""
     with tempfile.TemporaryDirectory() as directory:
-        Path(directory, "tokenizer.json").write_text(json.dumps(document(kind, special, with_processor)))
+        given = document(kind, special, with_processor)
+        if is_sequence:
+            given["pre_tokenizer"] = {"type": "Sequence", "pretokenizers": [given["pre_tokenizer"]]}
+        Path(directory, "tokenizer.json").write_text(json.dumps(given))
         config = {"added_tokens_decoder": {}, **(special if named else {}), **NEEDED.get(name, {})}
         Path(directory, "tokenizer_config.json").write_text(json.dumps(config))
         try:

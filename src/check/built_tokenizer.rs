@@ -19,7 +19,10 @@ use crate::knowledge::names::NameKind;
 use crate::knowledge::tokenizers::{BuiltTokenizer, BuiltTokenizers};
 use crate::knowledge::{Knowledge, Loader};
 
-/// Classes that open tokenizer.json as it is.
+/// The class that opens tokenizer.json as it is, also in the place of classes that are not known.
+const BACKEND: &str = "TokenizersBackend";
+
+/// Names of classes in whose place it is opened.
 const GENERIC: [&str; 4] = ["TokenizersBackend", "PythonBackend", "PreTrainedTokenizer", "MistralCommonBackend"];
 
 /// Types of models between which a vocabulary gives much the same tokens: both look up whole words.
@@ -63,6 +66,27 @@ pub(crate) fn building_class(checkpoint: &Checkpoint, knowledge: &Knowledge, loa
     class_of(checkpoint, knowledge, built, loader.version()).map(|(name, _)| name.to_owned())
 }
 
+/// The class that `AutoTokenizer` of a loader opens tokenizer.json with; `None` where code of a repository does, or where it is
+/// not known. Called for the verdict on the tokenizer.
+pub(super) fn opened_class(checkpoint: &Checkpoint, knowledge: &Knowledge, loader: Loader) -> Option<String> {
+    let version = loader.version();
+    if let Some(built) = knowledge.tokenizers.of(version).filter(|_| loader.major() >= 5) {
+        return name_of(checkpoint, knowledge, built, version).map(str::to_owned);
+    }
+    let text = |file: &str, pointer: &str| checkpoint.document(file)?.get(pointer)?.as_str();
+    let named = text(files::TOKENIZER_CONFIG, "/tokenizer_class");
+    let with_code: &[&str] =
+        if named.is_some() { &[files::TOKENIZER_CONFIG] } else { &[files::TOKENIZER_CONFIG, files::CONFIG] };
+    if has_code(checkpoint, with_code, &[ClassKind::Tokenizer.auto()]) {
+        return None;
+    }
+    let of_type = || knowledge.classes.class_of(version, ClassKind::Tokenizer, text(files::CONFIG, "/model_type")?);
+    let name = named.or_else(|| text(files::CONFIG, "/tokenizer_class")).or_else(of_type)?;
+    let lacks = |name: &str| knowledge.classes.lacks(version, ClassKind::Tokenizer, name);
+    let fast = format!("{name}Fast");
+    Some(if name.ends_with("Fast") || lacks(&fast) { name.to_owned() } else { fast })
+}
+
 /// The class that `AutoTokenizer` opens, if it builds the tokenizer itself.
 fn class_of<'k>(
     checkpoint: &'k Checkpoint,
@@ -70,12 +94,25 @@ fn class_of<'k>(
     built: &'k BuiltTokenizers,
     version: &str,
 ) -> Option<(&'k str, &'k BuiltTokenizer)> {
+    let name = name_of(checkpoint, knowledge, built, version)?;
+    built.class(name).map(|class| (name, class))
+}
+
+/// The class that `AutoTokenizer` of transformers 5 opens; `None` for code of a repository.
+fn name_of<'k>(
+    checkpoint: &'k Checkpoint,
+    knowledge: &'k Knowledge,
+    built: &'k BuiltTokenizers,
+    version: &str,
+) -> Option<&'k str> {
     let text = |file: &str, pointer: &str| checkpoint.document(file)?.get(pointer)?.as_str();
     let plain = |name: &'k str| name.strip_suffix("Fast").unwrap_or(name);
-    let path = text(files::CONFIG, "/_name_or_path").unwrap_or_default().to_lowercase();
-    let is_as_is = built.as_is.iter().any(|pattern| pattern.is_match(&path));
-    if is_as_is || has_code(checkpoint, &[files::TOKENIZER_CONFIG], &[ClassKind::Tokenizer.auto()]) {
+    if has_code(checkpoint, &[files::TOKENIZER_CONFIG], &[ClassKind::Tokenizer.auto()]) {
         return None;
+    }
+    let path = text(files::CONFIG, "/_name_or_path").unwrap_or_default().to_lowercase();
+    if built.as_is.iter().any(|pattern| pattern.is_match(&path)) {
+        return Some(BACKEND);
     }
     let named = text(files::TOKENIZER_CONFIG, "/tokenizer_class")
         .or_else(|| text(files::CONFIG, "/tokenizer_class"))
@@ -88,14 +125,15 @@ fn class_of<'k>(
         named.is_some() || !model_type.is_some_and(|t| knowledge.names.lacks(version, NameKind::ModelType, t))
     });
     if named == Some("LlamaTokenizer") && !is_overruled && has_byte_level(checkpoint) {
-        return None;
+        return Some(BACKEND);
     }
     let name = match (named, own) {
-        (Some(named), Some(own)) if named != own && GENERIC.contains(&own) => return None,
+        (Some(named), Some(own)) if named != own && GENERIC.contains(&own) => BACKEND,
         (Some(named), Some(own)) if named != own && is_overruled => own,
         (named, own) => named.or(own)?,
     };
-    built.class(name).map(|class| (name, class))
+    let is_unknown = knowledge.classes.lacks(version, ClassKind::Tokenizer, name);
+    Some(if is_unknown || GENERIC.contains(&name) { BACKEND } else { name })
 }
 
 /// Whether a part of tokenizer.json is byte-level; `AutoTokenizer` then opens it as it is instead of as `LlamaTokenizer`.

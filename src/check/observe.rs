@@ -8,7 +8,8 @@
 use super::view::{ExplainingFacts, FilesView, Observation, VersionsView};
 use super::{
     adapter, built_tokenizer, card, class_names, directory, finite, generation, index, model_type, module_imports,
-    modules, pickles, processor, programs, refusals, ropes, statistics, templates, tokenizer_json, tokens,
+    modules, pickles, processor, programs, refusals, ropes, statistics, templates, tokenizer_config, tokenizer_json,
+    tokens,
 };
 use crate::checkpoint::Fault;
 
@@ -50,6 +51,7 @@ const OF_VERSIONS: &[VersionsObserver] = &[
     |view| processor::faults(view).into(),
     adapter::fit::observe,
     generation::observe,
+    tokenizer_config::observe,
 ];
 
 /// Explainers of all faults.

@@ -2,6 +2,8 @@
 //!
 //! Source: tokenizers 0.19 to 0.22, with the Python packages of transformers 4.47.0, 4.57.6 and 5.23.0.
 
+pub(super) mod values;
+
 use crate::checkpoint::files;
 use std::collections::BTreeMap;
 
@@ -20,7 +22,7 @@ const READS_PAIRS: [u64; 2] = [4, 45];
 const MAX_DEPTH: usize = 64;
 
 /// The file, unless the tokenizer is built from another one.
-fn document(checkpoint: &Checkpoint) -> Option<&Document> {
+pub(super) fn document(checkpoint: &Checkpoint) -> Option<&Document> {
     checkpoint.document(files::TOKENIZER).filter(|_| checkpoint.tokenizer.source.as_deref() == Some(files::TOKENIZER))
 }
 
@@ -37,8 +39,8 @@ pub(super) fn paired_merges(checkpoint: &Checkpoint, asked: &Asked<'_>) -> Optio
 
 /// Faults of tokenizer.json under every version. Called by the engine once for a run.
 pub(super) fn faults(checkpoint: &Checkpoint, parts: &[TokenizerPart]) -> Vec<Fault> {
-    let Some(document) = document(checkpoint) else { return Vec::new() };
     let mut faults = Vec::new();
+    let Some(document) = document(checkpoint) else { return faults };
     for part in parts {
         if let Some(value) = document.get(&part.pointer) {
             unknown_types(value, part, &part.pointer, 0, &mut faults);

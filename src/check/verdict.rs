@@ -10,12 +10,13 @@ use crate::checkpoint::files;
 use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use super::finding::{Finding, FindingEffect};
 use super::index;
 use super::load::{LoadReport, Mismatch, SilentReason, Target, version};
 use super::view::JudgedObject;
-use crate::checkpoint::{Checkpoint, NotRead, untold};
+use crate::checkpoint::{Checkpoint, Document, NotRead, untold};
 use crate::knowledge::program::AskedProgram;
 use crate::knowledge::rule::{Consequence, Object};
 
@@ -55,6 +56,9 @@ impl From<Consequence> for LoadVerdict {
         }
     }
 }
+
+/// Why an object is not predicted that nothing judges whole.
+pub(crate) const ONLY_FAULTS: &str = "only known faults are looked for";
 
 /// What one loader does with one object of a checkpoint.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -206,6 +210,26 @@ impl Basis<'_> {
         unread.find(|(_, not_read)| *not_read != NotRead::Unreadable)
     }
 
+    /// Why `AutoTokenizer` of a loader may raise for config.json, which it reads first: transformers 5 for each tokenizer, and 4
+    /// where no file of the tokenizer names its class.
+    fn config_of_tokenizer(&self, loader: &str) -> Option<String> {
+        let is_read = loader.starts_with("5.") || self.checkpoint.tokenizer.tokenizer_class.is_none();
+        let raises = |effect: &FindingEffect| {
+            let concerns = (effect.object, effect.loader.as_str()) == (Object::Model, loader);
+            // transformers 5 reads a config that its class refuses with one of these errors as a config of no class.
+            let is_caught = loader.starts_with("5.") && effect.text.starts_with("ValueError");
+            concerns && effect.outcome == Consequence::Raises && !is_caught
+        };
+        let mut of_config = self
+            .findings
+            .iter()
+            .filter(|finding| finding.locations.iter().any(|location| location.file.as_deref() == Some(files::CONFIG)));
+        let is_object = |document: &Document| document.value.as_ref().is_some_and(Value::is_object);
+        let is_odd = self.checkpoint.document(files::CONFIG).is_some_and(|document| !is_object(document));
+        let refused = is_read && (is_odd || of_config.any(|finding| finding.effects.iter().any(raises)));
+        refused.then(|| format!("{} is read first, and its class may refuse it", files::CONFIG))
+    }
+
     /// A pickle with a construct that is not modelled, and the construct.
     fn doubt(&self) -> Option<(&str, &str)> {
         let mut pickles = self.checkpoint.shards.values().filter_map(|shard| Some((shard, shard.pickle()?)));
@@ -272,13 +296,18 @@ impl Basis<'_> {
             Some((LoadVerdict::NotPredicted, Some(format!("{file} {}, and was not read", not_read.words()))))
         };
         if object != Object::Model || is_program(loader) {
-            let known = || (LoadVerdict::NotPredicted, Some("only known faults are looked for".to_owned()));
+            let known = || (LoadVerdict::NotPredicted, Some(ONLY_FAULTS.to_owned()));
             let judged = self.objects.iter().find(|judged| (judged.object, judged.loader) == (object, loader));
             let alone = judged.map(|judged| match &judged.not_judged {
                 Some(why) => (LoadVerdict::NotPredicted, Some(why.clone())),
                 None => (LoadVerdict::Loads, None),
             });
+            let unread_config = || {
+                let why = self.config_of_tokenizer(loader).filter(|_| object == Object::Tokenizer)?;
+                Some((LoadVerdict::NotPredicted, Some(why)))
+            };
             return not_read()
+                .or_else(unread_config)
                 .or_else(|| self.not_understood().filter(|_| object == Object::Adapter && judged.is_some()))
                 .or(alone)
                 .unwrap_or_else(known);

@@ -1,16 +1,18 @@
 //! Facts about the tokenizer without running it: vocabulary, added tokens, length.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use serde_json::Value;
 
 use super::files::{self, FileContent, KnownFile, Object};
 use super::{Document, Fault, FaultKind, Place, pointer};
 
+mod merges;
 mod sentencepiece;
 mod vocabulary;
 
+pub use merges::Merges;
 pub use vocabulary::{Vocabulary, has_paired_merges};
 
 /// Vocabulary files that are read, in the order in which a tokenizer takes its ids from them: M2M100 and `Speech2Text` take
@@ -105,6 +107,8 @@ pub struct Tokenizer {
     pub source: Option<String>,
     /// Faults of vocabulary files that are not documents.
     pub faults: Vec<Fault>,
+    /// What the library does with the merges of tokenizer.json, once it was asked.
+    merges: OnceLock<Merges>,
     /// Whether tokenizer.json has its vocabulary as a list.
     is_list: bool,
     /// Every token outside the base vocabulary, with its id after loading.
@@ -194,6 +198,14 @@ impl Tokenizer {
     #[must_use]
     pub fn base(&self) -> Option<&Vocabulary> {
         self.vocabularies.get(self.source.as_deref()?).map(AsRef::as_ref)
+    }
+
+    /// What the library does with the merges of tokenizer.json. Called for the verdict on the tokenizer.
+    #[must_use]
+    pub fn merges(&self, document: &Document) -> Merges {
+        let of =
+            || self.vocabularies.get(files::TOKENIZER).map_or(Merges::Unknown, |known| Merges::of(document, known));
+        *self.merges.get_or_init(of)
     }
 
     /// The id that a slow tokenizer gives to the first token outside its vocabulary; `None` when it is not known: the

@@ -67,7 +67,7 @@ impl Loader {
     ///
     /// No other says anything about the version: a class that 4.47.0 has and 5.23.0 has not is not known to be in 5.24.0.
     /// Text that does not start with a number (`main`) is judged as the newest.
-    pub(super) fn beside(version: &str) -> Vec<Self> {
+    pub(crate) fn beside(version: &str) -> Vec<Self> {
         let mut numbers = version.split(|c: char| !c.is_ascii_digit()).map(str::parse::<u64>);
         let Some(Ok(major)) = numbers.next() else { return vec![Self::NEWEST] };
         let minor = numbers.next().and_then(Result::ok).unwrap_or(0);

@@ -6,7 +6,7 @@ use super::collapse::{NameGroup, collapse, collapse_with};
 use super::model::{CheckpointReport, Counts, MergeReport, MergeStage, NewRows, Report, TokenIds, Training};
 use crate::check::finding::Object;
 use crate::check::load::{LoadReport, SilentReason};
-use crate::check::verdict::{LoadVerdict, ObjectVerdict, PredictedLoad, is_program};
+use crate::check::verdict::{LoadVerdict, ONLY_FAULTS, ObjectVerdict, PredictedLoad, is_program};
 use crate::check::{Finding, FixHint, Location};
 use crate::checkpoint::escape;
 pub use crate::checkpoint::file_size as bytes;
@@ -441,6 +441,7 @@ fn by_verdict(loads: &[&PredictedLoad], title: &str) -> String {
 
 /// A sentence for each object that does not load, and for a model or adapter that is not predicted; then one for the other objects.
 pub fn objects(loads: &[PredictedLoad]) -> Vec<String> {
+    let is_beside = |object: Object| !matches!(object, Object::Model | Object::Adapter);
     let mut lines = Vec::new();
     let mut unjudged: Vec<&ObjectVerdict> = Vec::new();
     let mut same: Vec<(&ObjectVerdict, Vec<&PredictedLoad>)> = Vec::new();
@@ -459,9 +460,10 @@ pub fn objects(loads: &[PredictedLoad]) -> Vec<String> {
         let why = sentence(object.why.as_deref().unwrap_or_default());
         match object.verdict {
             LoadVerdict::Loads => {}
-            LoadVerdict::NotPredicted if !matches!(object.object, Object::Model | Object::Adapter) => {
+            LoadVerdict::NotPredicted if is_beside(object.object) && object.why.as_deref() == Some(ONLY_FAULTS) => {
                 unjudged.push(object);
             }
+            LoadVerdict::NotPredicted if is_beside(object.object) && failing.contains(&object.object) => {}
             verdict => {
                 let codes: Vec<String> = object.findings.iter().map(|code| name(code)).collect();
                 let codes = if codes.is_empty() { String::new() } else { format!(" ({})", codes.join(", ")) };
@@ -473,7 +475,7 @@ pub fn objects(loads: &[PredictedLoad]) -> Vec<String> {
     unjudged.dedup_by_key(|object| object.object);
     if !unjudged.is_empty() {
         let names: Vec<&str> = unjudged.iter().map(|object| object.object.name()).collect();
-        lines.push(format!("{} not predicted: only known faults are looked for", names.join(", ")));
+        lines.push(format!("{} not predicted: {ONLY_FAULTS}", names.join(", ")));
     }
     lines
 }

@@ -237,6 +237,8 @@ fn the_page_of_data_files_is_fresh() {
          | `refused/` | values of config.json that each model class refuses, written by `tools/derive_architectures.py accepts` |\n\
          | `directories.json5` | kinds of directories that other programs open, or none, with what to do |\n\
          | `statistics.json5` | where policies of robots keep their statistics |\n\
+         | `tokenizer-settings.json` | values that tokenizer classes refuse, written by `tools/loader_tokenizer_config.py` |\n\
+         | `tokenizer-values.json` | values that the tokenizers library refuses, written by `tools/loader_tokenizer_values.py` |\n\
          | `tokenizer-parts.json5` | types that the tokenizers library builds the parts of tokenizer.json from |\n\
          | `prediction-layers.json5` | layers that predict further tokens, which no class builds |\n\
          | `caches.json5` | keys of configs that tell how much the cache of keys and values takes |\n\

@@ -10,6 +10,7 @@ mod names;
 mod peft;
 mod refusals;
 mod seeded;
+mod tokenizer_files;
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;

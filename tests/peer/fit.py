@@ -87,6 +87,10 @@ def donors(work, rng, noise):
         }
         (directory / "tokenizer.json").write_text(json.dumps(tokenizer))
         (directory / "tokenizer.model").unlink()
+        # Where it is set, the class opens tokenizer.model.
+        config = directory / "tokenizer_config.json"
+        settings = {key: value for key, value in json.loads(config.read_text()).items() if key != "add_prefix_space"}
+        config.write_text(json.dumps(settings))
         places[role] = {name: vocabulary.index("▁" + name) for name in own}
         rows[role] = doubles(read_tensors(directory)[EMBEDDINGS[role]]).copy()
     draw = numpy.random.default_rng(rng.randrange(1 << 30))

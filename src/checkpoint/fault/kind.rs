@@ -362,6 +362,8 @@ fault_kinds! {
             type: Text, model: Text, raises?: Text, class: Text,
         },
         TokenizerPartUnknown = "tokenizer-part-unknown" { part: Text, type: Text },
+        TokenizerSettingRefused = "tokenizer-setting-refused" { class: Text, key: Text, value?: Any },
+        TokenizerValueRefused = "tokenizer-value-refused" { key: Text, value?: Any },
         TotalSizeNotOfClass = "total-size-not-of-class" {
             stated: Integer, computed: Integer, class: Text, value?: Text, others?: Text,
         },

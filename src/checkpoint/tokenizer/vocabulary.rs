@@ -79,7 +79,10 @@ impl Vocabulary {
                     Token::BeginArray => {
                         let Token::String(token) = scanner.next().ok()??.0 else { return None };
                         entries.push((token.decode().0, u32::try_from(entries.len()).ok()?));
-                        scanner.skip_rest_of(&Token::BeginArray).ok()?;
+                        let (Token::Number(_), Token::EndArray) = (scanner.next().ok()??.0, scanner.next().ok()??.0)
+                        else {
+                            return None;
+                        };
                     }
                     _ => return None,
                 }

@@ -28,6 +28,11 @@ fn donors(work: &Path, count: usize) {
             json!({ "version": "1.0", "added_tokens": [], "model": { "type": "BPE", "vocab": vocab, "merges": [] } });
         fs::write(dir.join("tokenizer.json"), tokenizer.to_string()).unwrap();
         fs::remove_file(dir.join("tokenizer.model")).unwrap();
+        // Where it is set, the class opens tokenizer.model.
+        let config = dir.join("tokenizer_config.json");
+        let mut settings: Map<String, Value> = serde_json::from_slice(&fs::read(&config).unwrap()).unwrap();
+        settings.remove("add_prefix_space");
+        fs::write(config, Value::Object(settings).to_string()).unwrap();
     }
 }
 

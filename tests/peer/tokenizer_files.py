@@ -1,0 +1,214 @@
+#!/usr/bin/env python3
+"""Directories of tokenizers with drawn faults: what `check` says of the tokenizer, and what AutoTokenizer does.
+
+    tokenizer_files.py FOLDER... [--count N] [--seed S] [--corpus DIRECTORY] [--list] [--keep DIRECTORY]
+
+Each FOLDER has one version of transformers, for the Python that runs this. The directories are those that the tokenizer classes of the
+version save; `--corpus` adds the directories below one that have files of a tokenizer. Most of the N directories for each version have
+changes: values of other kinds, keys and files of other classes, keys and files that are lost, damaged text. `check --for` that version
+says `raises`, `loads wrong`, `loads` or `not predicted` of the tokenizer. AutoTokenizer.from_pretrained opens it, or raises.
+
+`loads` where AutoTokenizer raises is a false clean, `raises` where it opens is a false raise.
+"""
+
+import argparse
+import collections
+import json
+import os
+import random
+import shutil
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from differential import told_by
+from fresh import version_in
+from peer import Tally, check, workplace
+
+LIMITS = {"false clean": 0.02, "false raise": 0.015}
+SHARE = 0.8
+BATCH = 300
+FILES = ["tokenizer_config.json", "tokenizer.json", "special_tokens_map.json", "added_tokens.json", "config.json"]
+LARGEST = 40_000_000
+TOKEN = {"content": "<new>", "special": True, "lstrip": False, "rstrip": False, "normalized": False, "single_word": False}
+VALUES = [None, True, False, 0, 1, -1, 7, 1.5, "", "x", "<s>", "</s>", "<nope>", [], ["x"], ["<s>"], {}, {"content": "<s>"},
+          TOKEN, {"__type": "AddedToken", **TOKEN}, {"x": 1}, [TOKEN], "left", 512]  # fmt: skip
+
+
+# One version.
+
+
+def places(value, path=()):
+    """The paths of the keys and of the first elements below a value."""
+    items = value.items() if isinstance(value, dict) else enumerate(value[:6]) if isinstance(value, list) else ()
+    for key, inner in items:
+        yield (*path, key)
+        if len(path) < 4:
+            yield from places(inner, (*path, key))
+
+
+def changed_text(rng, text):
+    at = rng.randrange(len(text))
+    cut, comma, garbage = text[:at], text.rstrip().removesuffix("}") + ",}", text[:at] + "x" + text[at:]
+    return rng.choice([cut, comma, garbage, "\ufeff" + text, f"[{text}]"])
+
+
+def change(rng, folder, others):
+    """One change of a file in the folder, and what was done."""
+    present = [name for name in FILES if (folder / name).exists()]
+    name = rng.choice([*present, *(["tokenizer_config.json"] * 2)])
+    if name not in present:
+        return ""
+    file, other = folder / name, rng.choice(others) / name
+    how = rng.random()
+    if how < 0.08:
+        file.unlink()
+        return f"no {name}"
+    if how < 0.14:
+        if other.exists():
+            shutil.copy(other, file)
+        return f"{name} of {other.parent.name}"
+    text = file.read_text()
+    if how < 0.2:
+        file.write_text(changed_text(rng, text))
+        return f"damaged {name}"
+    try:
+        document = json.loads(text)
+        given = json.loads(other.read_text()) if how < 0.35 else {}
+    except (OSError, ValueError):
+        return ""
+    found = list(places(document))
+    if given:
+        key = rng.choice(sorted(given))
+        document[key] = given[key]
+        done = f"{key} of {other.parent.name}"
+    elif found:
+        path = rng.choice(found)
+        parent = document
+        for step in path[:-1]:
+            parent = parent[step]
+        if rng.random() < 0.35:
+            parent.pop(path[-1])
+            done = f"no {path}"
+        else:
+            parent[path[-1]] = rng.choice(VALUES)
+            done = f"{path} = {json.dumps(parent[path[-1]])[:40]}"
+    else:
+        return ""
+    file.write_text(json.dumps(document))
+    return f"{name}: {done}"
+
+
+def happened(folder):
+    """What AutoTokenizer raises, in a process of its own: the library may abort."""
+    from transformers import AutoTokenizer
+
+    answer = folder.parent / "answer"
+    pid = os.fork()
+    if pid == 0:
+        try:
+            AutoTokenizer.from_pretrained(folder)
+            said = None
+        except BaseException as error:  # the library panics, too
+            said = f"{type(error).__name__}: {error}"[:300]
+        answer.write_text(json.dumps(said))
+        os._exit(0)
+    os.waitpid(pid, 0)
+    said = json.loads(answer.read_text()) if answer.exists() else "died"
+    answer.unlink(missing_ok=True)
+    return said
+
+
+def worker(_, work, seed, count, corpus):
+    """Under one version: makes directories, and writes what AutoTokenizer does with each."""
+    import warnings
+
+    sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
+    import loader_tokenizer_config
+    import transformers
+
+    warnings.simplefilter("ignore")
+    transformers.utils.logging.set_verbosity(transformers.utils.logging.CRITICAL)
+    work = Path(work)
+    made = [place for _, place in loader_tokenizer_config.bases(work / "bases")]
+    published = []
+    if corpus != "-":
+        published = sorted({file.parent for name in FILES[:3] for file in Path(corpus).rglob(name)})
+        published = [place for place in published if sum(f.stat().st_size for f in place.iterdir() if f.is_file()) < LARGEST]
+    with open(work / "told.partial", "w") as out:
+        for number in range(len(published) + int(count)):
+            rng = random.Random(f"{seed} {transformers.__version__} {number}")
+            folder = work / f"t-{number}"
+            if number < len(published):
+                base, changes = published[number], 0
+            else:
+                base, changes = rng.choice(made), rng.choice([0, 1, 1, 1, 2])
+            shutil.copytree(base, folder, ignore=lambda at, names: [n for n in names if Path(at, n).is_dir()])
+            done = [change(rng, folder, made) for _ in range(changes)]
+            told = {"folder": str(folder), "done": f"{base.name}; {'; '.join(done)}", "actual": happened(folder)}
+            out.write(json.dumps({**told, "published": number < len(published)}) + "\n")
+    (work / "told.partial").rename(work / "told.jsonl")
+
+
+# All versions.
+
+
+def run_worker(folder, work, a):
+    """The directories of one version."""
+    version = version_in(folder)
+    return version, told_by(__file__, folder, work / version, a.seed, a.count, a.corpus or "-")
+
+
+def compared(said, actual):
+    if said in ("not-predicted", "none"):
+        return "not predicted"
+    if (said == "raises") == (actual is not None):
+        return "right"
+    return "false clean" if actual is not None else "false raise"
+
+
+def judge(tally, a, version, told):
+    counts = {"published": collections.Counter(), "drawn": collections.Counter()}
+    for at in range(0, len(told), BATCH):
+        batch = told[at : at + BATCH]
+        entries = check("--for", f"transformers=={version}", *(t["folder"] for t in batch))[0]
+        for one in batch:
+            load = next(load for load in entries[os.path.realpath(one["folder"])]["loads"] if load["loader"] == version)
+            said = next((o for o in load["objects"] if o["object"] == "tokenizer"), {"verdict": "none"})
+            outcome = compared(said["verdict"], one["actual"])
+            # A directory that offers no tokenizer has no verdict on it.
+            if said["verdict"] != "none" or one["actual"] is None:
+                counts["published" if one["published"] else "drawn"][outcome] += 1
+            if a.list and outcome != "right":
+                why = said.get("why") or ", ".join(said.get("findings", []))
+                line = f"{outcome}: {version} {one['folder']} [{one['done']}]: said {said['verdict']} ({why}); {one['actual']}"
+                print(line[:600])
+    for kind, of in counts.items():
+        total, judged = sum(of.values()), sum(of.values()) - of["not predicted"]
+        print(f"{version}: {total} {kind}, {dict(sorted(of.items()))}", flush=True)
+        for outcome, limit in LIMITS.items():
+            tally.expect(of[outcome] <= max(1, limit * judged), f"{version}: {of[outcome]} of {judged} {kind} {outcome}")
+        tally.expect(judged >= SHARE * total, f"{version}: {judged} of {total} {kind} are predicted")
+
+
+def main():
+    if sys.argv[1:2] == ["--worker"]:
+        return worker(*sys.argv[2:])
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("folder", nargs="+")
+    p.add_argument("--count", type=int, default=400, help="for each version")
+    p.add_argument("--seed", default="1")
+    p.add_argument("--corpus", help="a directory with published files")
+    p.add_argument("--list", action="store_true", help="print every verdict that is not right")
+    p.add_argument("--keep", type=Path)
+    a = p.parse_args()
+    tally = Tally()
+    with workplace() as temporary, ThreadPoolExecutor(2) as pool:
+        work = a.keep or temporary
+        for version, told in pool.map(lambda folder: run_worker(folder, work, a), a.folder):
+            judge(tally, a, version, told)
+    tally.finish()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
