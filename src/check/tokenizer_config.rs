@@ -9,6 +9,7 @@ use super::built_tokenizer::{building_class, opened_class};
 use super::model_type::{CAP, short};
 use super::tokenizer_json::{self, values};
 use super::view::{JudgedObject, Observation, VersionsView};
+use crate::checkpoint::fault::Faults;
 use crate::checkpoint::files::{self, Object};
 use crate::checkpoint::tokenizer::Merges;
 use crate::checkpoint::{Checkpoint, Document, Fault, FaultKind, Place, escape, pointer};
@@ -36,7 +37,7 @@ pub(super) fn observe(view: &VersionsView<'_>) -> Observation {
         let Some(judged) = Loader::beside(target.version()).into_iter().map(judged).reduce(JudgedFiles::and) else {
             continue;
         };
-        for fault in judged.refused {
+        for fault in judged.refused.into_vec() {
             fault.join(&mut faults, target.loader.version());
         }
         let not_judged = judged.unknown;
@@ -50,7 +51,7 @@ pub(super) fn observe(view: &VersionsView<'_>) -> Observation {
 struct JudgedFiles {
     /// The class that the files name.
     class: String,
-    refused: Vec<Fault>,
+    refused: Faults,
     /// Why it may raise for other reasons.
     unknown: Option<String>,
 }
@@ -65,15 +66,12 @@ impl JudgedFiles {
         let is_in = |faults: &[Fault], fault: &Fault| {
             faults.iter().any(|same| (same.kind, &same.places) == (fault.kind, &fault.places))
         };
-        let differs = self.refused.iter().find(|fault| !is_in(&other.refused, fault));
-        let differs = differs.or_else(|| other.refused.iter().find(|fault| !is_in(&self.refused, fault)));
-        let differs = differs.map(|_| "the versions beside this one do not refuse the same values".to_owned());
-        let unknown = self.unknown.or(other.unknown).or(differs);
-        Self {
-            class: self.class,
-            refused: self.refused.into_iter().filter(|fault| is_in(&other.refused, fault)).collect(),
-            unknown,
-        }
+        let (own, others) = (self.refused.into_vec(), other.refused.into_vec());
+        let is_same = own.iter().all(|fault| is_in(&others, fault)) && others.iter().all(|fault| is_in(&own, fault));
+        let differs = (!is_same).then(|| "the versions beside this one do not refuse the same values".to_owned());
+        let mut refused = Faults::default();
+        refused.extend(own.into_iter().filter(|fault| is_in(&others, fault)));
+        Self { class: self.class, refused, unknown: self.unknown.or(other.unknown).or(differs) }
     }
 
     fn doubt(&mut self, why: String) {

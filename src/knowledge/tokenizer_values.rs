@@ -67,11 +67,13 @@ impl TokenizerValues {
 
     /// The keys that an object may not be without, or perhaps not.
     pub fn needed<'t>(&'t self, object: &'t str) -> impl Iterator<Item = (&'t str, TokenizerValue)> {
-        let below = self.places.range(format!("{object}/")..).map_while(move |(place, _)| {
-            let rest = place.strip_prefix(object)?.strip_prefix('/')?;
-            Some((place, rest))
+        // At the top, a place is a key alone; those of parts begin with their slot and a blank.
+        let start = if object.is_empty() { String::new() } else { format!("{object}/") };
+        let below = self.places.range(start..).map_while(move |(place, _)| {
+            let rest = place.strip_prefix(object)?;
+            Some((place, if object.is_empty() { rest } else { rest.strip_prefix('/')? }))
         });
-        let own = below.filter(|(_, key)| !key.contains('/') && *key != "*");
+        let own = below.filter(|(_, key)| !key.contains(['/', ' ']) && *key != "*");
         own.filter_map(|(place, key)| Some((key, self.outcome(place, "absent")?)))
             .filter(|(_, outcome)| *outcome != TokenizerValue::Accepted)
     }

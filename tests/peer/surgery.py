@@ -63,6 +63,11 @@ REFUSED = [
         "the host was saved by 4.57, which cannot run this language model",
     ),
     (
+        r"(openvla|spatialvla) x .*",
+        "add_prefix_space is true, and LlamaTokenizer raises",
+        "4.47 has the class of the host, and does not open the tokenizer that 5.23 saved: it wants tokenizer.model",
+    ),
+    (
         r".* sees with siglip2",
         "",
         "a tower of SigLIP 2 with patches of any size takes other inputs; SigLIP 2 of a fixed size is a SigLIP",

@@ -6,6 +6,7 @@ use serde_json::{Map, Value};
 
 use super::MAX_DEPTH;
 use crate::check::model_type::{CAP, short};
+use crate::checkpoint::fault::KIND_CAP;
 use crate::checkpoint::tokenizer::Vocabulary;
 use crate::checkpoint::{Document, Fault, FaultKind, Place, escape, files, pointer};
 use crate::knowledge::tokenizer_values::{TokenizerValue, TokenizerValues};
@@ -39,7 +40,6 @@ const OF_VOCABULARY: [&str; 2] = ["vocab", "merges"];
 const CHOICES: [&str; 6] = ["behavior", "direction", "prepend_scheme", "strategy", "type", "version"];
 
 /// What a document has that the library refuses, and the first pointer to a value that is not judged.
-#[derive(Default)]
 pub(in crate::check) struct JudgedTokenizer {
     pub(in crate::check) refused: Vec<Fault>,
     pub(in crate::check) unknown: Option<String>,
@@ -51,31 +51,36 @@ pub(in crate::check) fn judged(
     base: Option<&Vocabulary>,
     values: &TokenizerValues,
 ) -> JudgedTokenizer {
-    let mut judge = Judge { values, base, document, found: JudgedTokenizer::default() };
+    let mut judge = Judge { values, base, document, refused: Vec::new(), unknown: None };
     if let Some(object) = document.value.as_ref().and_then(Value::as_object) {
         judge.object(object, "", "", 0);
     }
-    judge.found
+    JudgedTokenizer { refused: judge.refused, unknown: judge.unknown }
 }
 
 struct Judge<'j> {
     values: &'j TokenizerValues,
     base: Option<&'j Vocabulary>,
     document: &'j Document,
-    found: JudgedTokenizer,
+    refused: Vec<Fault>,
+    unknown: Option<String>,
 }
 
 impl Judge<'_> {
+    /// Adds a fault, up to the number that is listed of a kind.
     fn refuse(&mut self, at: &str, value: Option<&Value>) {
+        if self.refused.len() >= KIND_CAP {
+            return;
+        }
         let key = at.rsplit('/').next().unwrap_or_default();
         let fault = Fault::new(FaultKind::TokenizerValueRefused)
             .at(Place::file(files::TOKENIZER).pointer(at))
             .with("key", escape(key, CAP));
-        self.found.refused.push(value.into_iter().fold(fault, |fault, value| fault.with("value", short(value))));
+        self.refused.push(value.into_iter().fold(fault, |fault, value| fault.with("value", short(value))));
     }
 
     fn doubt(&mut self, at: &str) {
-        self.found.unknown.get_or_insert_with(|| at.to_owned());
+        self.unknown.get_or_insert_with(|| at.to_owned());
     }
 
     /// The keys of an object at a place, and the values below.

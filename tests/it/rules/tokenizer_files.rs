@@ -30,8 +30,8 @@ fn library() -> Value {
     })
 }
 
-/// The verdicts on a tokenizer of a class, with one value set in one of its files, and the pointers of TOK028 and TOK029.
-fn judged(class: &str, file: &str, pointer: &str, value: Value) -> ([LoadVerdict; 3], Vec<String>) {
+/// The verdicts on a tokenizer of a class, with one value set or a key taken out in one of its files, and the pointers of TOK028 and TOK029.
+fn judged(class: &str, file: &str, pointer: &str, value: Option<Value>) -> ([LoadVerdict; 3], Vec<String>) {
     let mut documents = [
         ("config.json", json!({ "model_type": "gpt2", "architectures": ["GPT2LMHeadModel"] })),
         ("tokenizer.json", library()),
@@ -39,9 +39,10 @@ fn judged(class: &str, file: &str, pointer: &str, value: Value) -> ([LoadVerdict
     ];
     let document = documents.iter_mut().find(|(name, _)| *name == file).unwrap();
     let (parent, key) = pointer.rsplit_once('/').unwrap();
-    match document.1.pointer_mut(parent).unwrap() {
-        Value::Array(list) => list[key.parse::<usize>().unwrap()] = value,
-        object => object[key] = value,
+    match (document.1.pointer_mut(parent).unwrap(), value) {
+        (Value::Array(list), Some(value)) => list[key.parse::<usize>().unwrap()] = value,
+        (object, Some(value)) => object[key] = value,
+        (object, None) => drop(object.as_object_mut().unwrap().remove(key).unwrap()),
     }
     let files = documents.map(|(name, document)| (name.to_owned(), document.to_string().into_bytes()));
     let checkpoint = Arc::new(Checkpoint::read(Source::Memory(MemoryFiles::new("model", files))).unwrap());
@@ -87,9 +88,21 @@ fn a_tokenizer_loads_as_its_class_and_the_library_read_it() {
         ("PreTrainedTokenizerFast", TOKENIZER, "/model/vocab/b", json!(-1), [Raises; 3]),
         ("PreTrainedTokenizerFast", TOKENIZER, "/model/fuse_unk", json!(null), [Loads; 3]),
     ] {
-        let (found, pointers) = judged(class, file, pointer, value.clone());
+        let (found, pointers) = judged(class, file, pointer, Some(value.clone()));
         let case = format!("{class} {file} {pointer} {value}");
         assert_eq!(found, verdicts, "{case}: {pointers:?}");
         assert_eq!(pointers.is_empty(), !verdicts.contains(&Raises), "{case}: {pointers:?}");
+    }
+    for (pointer, verdicts) in [
+        ("/added_tokens", [Loads; 3]),
+        ("/decoder", [Loads; 3]),
+        ("/model", [Raises; 3]),
+        ("/model/merges", [Raises; 3]),
+        ("/model/vocab", [Raises; 3]),
+        ("/pre_tokenizer/type", [NotPredicted; 3]),
+        ("/version", [Loads; 3]),
+    ] {
+        let (found, pointers) = judged("PreTrainedTokenizerFast", TOKENIZER, pointer, None);
+        assert_eq!(found, verdicts, "no {pointer}: {pointers:?}");
     }
 }
