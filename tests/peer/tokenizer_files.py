@@ -69,6 +69,8 @@ def change(rng, folder, others):
             shutil.copy(other, file)
         return f"{name} of {other.parent.name}"
     text = file.read_text()
+    if not text:
+        return ""
     if how < 0.2:
         file.write_text(changed_text(rng, text))
         return f"damaged {name}"
@@ -78,7 +80,7 @@ def change(rng, folder, others):
     except (OSError, ValueError):
         return ""
     found = list(places(document))
-    if given:
+    if given and isinstance(document, dict):
         key = rng.choice(sorted(given))
         document[key] = given[key]
         done = f"{key} of {other.parent.name}"
