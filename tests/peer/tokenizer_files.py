@@ -26,7 +26,7 @@ from fresh import version_in
 from peer import Tally, check, workplace
 
 LIMITS = {"false clean": 0.02, "false raise": 0.015}
-SHARE = 0.8
+SHARE = 0.7
 BATCH = 300
 FILES = ["tokenizer_config.json", "tokenizer.json", "special_tokens_map.json", "added_tokens.json", "config.json"]
 LARGEST = 40_000_000
