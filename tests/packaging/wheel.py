@@ -25,7 +25,7 @@ from release_notes import crate_version  # noqa: E402
 INTEGRATIONS = PROJECT / "docs/integrations.md"
 SOUND = PROJECT / "fixtures/donors/llava3d-tiny"
 # Bytes of the wheel: most of it is the program with the data of `rules/`.
-LIMIT = 9_100_000
+LIMIT = 9_300_000
 MODULES = ["__init__.py", "__main__.py", "py.typed"]
 
 
