@@ -61,14 +61,8 @@ pub(super) fn observe(view: &VersionsView<'_>) -> Observation {
     let VersionsView { checkpoint, knowledge, asked, .. } = *view;
     let Some(document) = checkpoint.document(files::GENERATION_CONFIG) else { return Observation::default() };
     // Any other fault of the text is an `OSError`: the class sees no values then.
-    let is_python = |fault: &Fault| {
-        matches!(
-            fault.kind,
-            FaultKind::NonFiniteNumber | FaultKind::HugeNumber | FaultKind::DuplicateJsonKey | FaultKind::LoneSurrogate
-        )
-    };
     let given = document.value.as_ref().and_then(Value::as_object);
-    let Some(given) = given.filter(|_| document.faults.iter().all(is_python)) else {
+    let Some(given) = given.filter(|_| document.faults.iter().all(Fault::is_read_by_python)) else {
         let not_judged = |target: &Target| JudgedObject {
             object: Object::Generation,
             loader: target.loader.version(),
@@ -160,7 +154,7 @@ fn refused_value(key: &str, value: &Value, because: &str, raises: &str) -> Fault
 }
 
 /// Whether Python counts a value as true.
-fn is_truthy(value: &Value) -> bool {
+pub(super) fn is_truthy(value: &Value) -> bool {
     match value {
         Value::Null => false,
         Value::Bool(flag) => *flag,

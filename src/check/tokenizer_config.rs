@@ -5,7 +5,8 @@
 
 use serde_json::{Map, Value};
 
-use super::built_tokenizer::{building_class, opened_class};
+use super::built_tokenizer::opened_class;
+use super::generation::is_truthy;
 use super::model_type::{CAP, short};
 use super::tokenizer_json::{self, values};
 use super::view::{JudgedObject, Observation, VersionsView};
@@ -18,15 +19,12 @@ use crate::knowledge::tokenizer_config::TokenizerClass;
 use crate::knowledge::tokenizer_values::TokenizerValue;
 use crate::knowledge::{Knowledge, Loader};
 
-/// Parts of tokenizer.json that classes read.
-const SLOTS: [&str; 5] = ["normalizer", "pre_tokenizer", "post_processor", "decoder", "model"];
-
 /// Faults of refused values, each under the loaders that raise, and for each loader whether all values were judged.
 pub(super) fn observe(view: &VersionsView<'_>) -> Observation {
     let VersionsView { checkpoint, knowledge, asked, .. } = *view;
     // Other files are not judged.
     let Some(document) = tokenizer_json::document(checkpoint) else { return Observation::default() };
-    let is_read = document.value.is_some() && document.faults.iter().all(is_python);
+    let is_read = document.value.is_some() && document.faults.iter().all(Fault::is_read_by_python);
     let of_file = is_read.then(|| values::judged(document, checkpoint.tokenizer.base(), &knowledge.tokenizer_values));
     let (mut faults, mut objects) = (Vec::new(), Vec::new());
     for target in asked.targets {
@@ -94,14 +92,6 @@ impl JudgedFiles {
     }
 }
 
-/// Faults of a text that Python reads all the same.
-fn is_python(fault: &Fault) -> bool {
-    matches!(
-        fault.kind,
-        FaultKind::NonFiniteNumber | FaultKind::HugeNumber | FaultKind::DuplicateJsonKey | FaultKind::LoneSurrogate
-    )
-}
-
 /// Whether a key names files, or changes what is opened.
 fn opens_otherwise(key: &str, value: &Value) -> bool {
     let is_off = || match value {
@@ -142,7 +132,7 @@ fn judged(
     };
     found.unknown.clone_from(&of_values.unknown.as_ref().map(|at| format!("whether {at} loads is not known")));
     // A class that builds the tokenizer itself takes the vocabulary without the library.
-    let builds = building_class(checkpoint, knowledge, loader).is_some();
+    let builds = knowledge.tokenizers.of(loader.version()).is_some_and(|built| built.class(&name).is_some());
     let is_own = |fault: &&Fault| {
         let at = fault.places.first().and_then(|place| place.pointer.as_deref()).unwrap_or_default();
         builds && (at.starts_with("/added_tokens") || at.starts_with("/model"))
@@ -153,7 +143,7 @@ fn judged(
     }
     found.refused.extend(of_values.refused.iter().filter(|fault| !is_own(fault)).cloned());
     of_vocabulary(&mut found, checkpoint, document, &name, builds);
-    for slot in SLOTS {
+    for slot in values::PARTS {
         let part = document.get(&format!("/{slot}")).filter(|part| !part.is_null());
         let kind = part.map_or(Some("null"), |part| part.get("type")?.as_str());
         // A type that no version has is another fault, as is a model that a class builds in the place of this one.
@@ -164,7 +154,7 @@ fn judged(
     let config = checkpoint.document(files::TOKENIZER_CONFIG);
     let empty = Map::new();
     let Some(settings) = config.map_or(Some(&empty), |config| {
-        config.value.as_ref().and_then(Value::as_object).filter(|_| config.faults.iter().all(is_python))
+        config.value.as_ref().and_then(Value::as_object).filter(|_| config.faults.iter().all(Fault::is_read_by_python))
     }) else {
         found.doubt(format!("{} has no values that were read", files::TOKENIZER_CONFIG));
         return found;
@@ -262,17 +252,6 @@ fn decided(key: &str, value: &Value, settings: &Map<String, Value>) -> Tokenizer
     }
 }
 
-fn is_truthy(value: &Value) -> bool {
-    match value {
-        Value::Null => false,
-        Value::Bool(value) => *value,
-        Value::Number(number) => number.as_f64().is_none_or(|number| number.abs() > 0.0),
-        Value::String(text) => !text.is_empty(),
-        Value::Array(list) => !list.is_empty(),
-        Value::Object(object) => !object.is_empty(),
-    }
-}
-
 /// Judges the entries of `added_tokens_decoder`.
 fn of_decoder(found: &mut JudgedFiles, class: &TokenizerClass<'_>, name: &str, value: &Value) {
     let (file, at) = (files::TOKENIZER_CONFIG, "/added_tokens_decoder");
@@ -308,7 +287,7 @@ fn of_older_files(
     let read = |file: &str| checkpoint.has_file(file).then(|| checkpoint.document(file));
     for file in [files::SPECIAL_TOKENS, files::ADDED_TOKENS] {
         let Some(given) = read(file) else { continue };
-        let given = given.filter(|given| given.faults.iter().all(is_python));
+        let given = given.filter(|given| given.faults.iter().all(Fault::is_read_by_python));
         let Some(entries) = given.and_then(|given| given.value.as_ref()?.as_object()) else {
             found.doubt(format!("{file} has no values that were read"));
             continue;

@@ -2,6 +2,7 @@
 //!
 //! Source: tokenizers 0.19 to 0.22, with the Python packages of transformers 4.47.0, 4.57.6 and 5.23.0.
 
+mod charsmap;
 pub(super) mod values;
 
 use crate::checkpoint::files;

@@ -75,6 +75,14 @@ impl Fault {
         }
     }
 
+    /// Whether Python's `json` reads a text with this fault all the same.
+    pub(crate) const fn is_read_by_python(&self) -> bool {
+        matches!(
+            self.kind,
+            FaultKind::NonFiniteNumber | FaultKind::HugeNumber | FaultKind::DuplicateJsonKey | FaultKind::LoneSurrogate
+        )
+    }
+
     /// Adds a detail under a key that the kind declares.
     #[must_use]
     pub(crate) fn with(mut self, name: &str, value: impl Into<Value>) -> Self {

@@ -6,7 +6,8 @@
 Each FOLDER has one version of transformers, for the Python that runs this. The directories are those that the tokenizer classes of the
 version save; `--corpus` adds the directories below one that have files of a tokenizer. Most of the N directories for each version have
 changes: values of other kinds, keys and files of other classes, keys and files that are lost, damaged text. `check --for` that version
-says `raises`, `loads wrong`, `loads` or `not predicted` of the tokenizer. AutoTokenizer.from_pretrained opens it, or raises.
+says `raises`, `loads wrong`, `loads` or `not predicted` of the tokenizer. AutoTokenizer.from_pretrained opens it, or raises. The cases of
+tests/data/tokenizer-cases.json are opened as well, and have to be what that file says.
 
 `loads` where AutoTokenizer raises is a false clean, `raises` where it opens is a false raise.
 """
@@ -23,6 +24,7 @@ from pathlib import Path
 
 from differential import told_by
 from fresh import version_in
+from generation import compared
 from peer import Tally, check, workplace
 
 LIMITS = {"false clean": 0.02, "false raise": 0.015}
@@ -30,6 +32,7 @@ SHARE = 0.7
 BATCH = 300
 FILES = ["tokenizer_config.json", "tokenizer.json", "special_tokens_map.json", "added_tokens.json", "config.json"]
 LARGEST = 40_000_000
+CASES = Path(__file__).resolve().parents[1] / "data" / "tokenizer-cases.json"
 TOKEN = {"content": "<new>", "special": True, "lstrip": False, "rstrip": False, "normalized": False, "single_word": False}
 VALUES = [None, True, False, 0, 1, -1, 7, 1.5, "", "x", "<s>", "</s>", "<nope>", [], ["x"], ["<s>"], {}, {"content": "<s>"},
           TOKEN, {"__type": "AddedToken", **TOKEN}, {"x": 1}, [TOKEN], "left", 512]  # fmt: skip
@@ -121,6 +124,23 @@ def happened(folder):
     return said
 
 
+def case_files(folder, files, case):
+    """Writes the files of a case."""
+    files = json.loads(json.dumps(files))
+    files["tokenizer_config.json"]["tokenizer_class"] = case["class"]
+    *steps, last = case["pointer"].split("/")[1:]
+    parent = files[case["file"]]
+    for step in steps:
+        parent = parent[step]
+    if "to" in case:
+        parent[int(last) if isinstance(parent, list) else last] = case["to"]
+    else:
+        del parent[last]
+    folder.mkdir()
+    for name, document in files.items():
+        (folder / name).write_text(json.dumps(document))
+
+
 def worker(_, work, seed, count, corpus):
     """Under one version: makes directories, and writes what AutoTokenizer does with each."""
     import warnings
@@ -149,6 +169,13 @@ def worker(_, work, seed, count, corpus):
             done = [change(rng, folder, made) for _ in range(changes)]
             told = {"folder": str(folder), "done": f"{base.name}; {'; '.join(done)}", "actual": happened(folder)}
             out.write(json.dumps({**told, "published": number < len(published)}) + "\n")
+        data = json.loads(CASES.read_text())
+        at = data["versions"].index(transformers.__version__)
+        for number, case in enumerate(data["cases"]):
+            folder = work / f"c-{number}"
+            case_files(folder, data["files"], case)
+            told = {"folder": str(folder), "done": json.dumps(case), "actual": happened(folder)}
+            out.write(json.dumps({**told, "published": False, "expected": case["actual"][at]}) + "\n")
     (work / "told.partial").rename(work / "told.jsonl")
 
 
@@ -161,15 +188,10 @@ def run_worker(folder, work, a):
     return version, told_by(__file__, folder, work / version, a.seed, a.count, a.corpus or "-")
 
 
-def compared(said, actual):
-    if said in ("not-predicted", "none"):
-        return "not predicted"
-    if (said == "raises") == (actual is not None):
-        return "right"
-    return "false clean" if actual is not None else "false raise"
-
-
 def judge(tally, a, version, told):
+    for one in told:
+        expected, actual = one.get("expected"), one["actual"]
+        tally.expect(expected in (None, "raises" if actual else "loads"), f"{version}: {one['done']}: {actual}")
     counts = {"published": collections.Counter(), "drawn": collections.Counter()}
     for at in range(0, len(told), BATCH):
         batch = told[at : at + BATCH]

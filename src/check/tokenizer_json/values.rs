@@ -5,6 +5,7 @@
 use serde_json::{Map, Value};
 
 use super::MAX_DEPTH;
+use super::charsmap::is_charsmap;
 use crate::check::model_type::{CAP, short};
 use crate::checkpoint::fault::KIND_CAP;
 use crate::checkpoint::tokenizer::Vocabulary;
@@ -20,18 +21,10 @@ const LISTS: [(&str, &str); 4] = [
 ];
 
 /// Parts at the top.
-const PARTS: [&str; 5] = ["normalizer", "pre_tokenizer", "post_processor", "decoder", "model"];
+pub(in crate::check) const PARTS: [&str; 5] = ["normalizer", "pre_tokenizer", "post_processor", "decoder", "model"];
 
 /// Objects with keys of any name.
 const FREE: [&str; 2] = ["vocab", "special_tokens"];
-
-/// Length of a pattern that is read.
-const MAX_PATTERN: usize = 4096;
-
-/// Whether a pattern is written as those of the library's engine, of which this one's syntax is a part.
-fn is_pattern(text: &str) -> bool {
-    text.len() <= MAX_PATTERN && fancy_regex::Expr::parse_tree(text).is_ok()
-}
 
 /// Keys whose values the reader of the vocabulary judges.
 const OF_VOCABULARY: [&str; 2] = ["vocab", "merges"];
@@ -51,7 +44,7 @@ pub(in crate::check) fn judged(
     base: Option<&Vocabulary>,
     values: &TokenizerValues,
 ) -> JudgedTokenizer {
-    let mut judge = Judge { values, base, document, refused: Vec::new(), unknown: None };
+    let mut judge = Judge { values, base, refused: Vec::new(), unknown: None };
     if let Some(object) = document.value.as_ref().and_then(Value::as_object) {
         judge.object(object, "", "", 0);
     }
@@ -61,7 +54,6 @@ pub(in crate::check) fn judged(
 struct Judge<'j> {
     values: &'j TokenizerValues,
     base: Option<&'j Vocabulary>,
-    document: &'j Document,
     refused: Vec<Fault>,
     unknown: Option<String>,
 }
@@ -140,7 +132,6 @@ impl Judge<'_> {
         match self.values.given(place, value) {
             // Its only key decides.
             Some(TokenizerValue::Depends) if value.is_object() && self.values.is_closed(place) => {}
-            Some(TokenizerValue::Refused) if self.fits_template(key, at) => {}
             Some(TokenizerValue::Refused) if !self.is_container(place, value) => return self.refuse(at, Some(value)),
             Some(TokenizerValue::Depends) => match self.decided(place, at, value) {
                 Some(true) => {}
@@ -163,16 +154,6 @@ impl Judge<'_> {
         }
     }
 
-    /// Whether these are the tokens of a template that writes none.
-    fn fits_template(&self, key: &str, at: &str) -> bool {
-        let Some(part) = at.strip_suffix("/special_tokens").filter(|_| key == "special_tokens") else { return false };
-        let pieces =
-            ["single", "pair"].into_iter().filter_map(|list| self.document.get(&format!("{part}/{list}"))?.as_array());
-        let writes = pieces.flatten().any(|piece| piece.get("SpecialToken").is_some());
-        let tokens = self.document.get(at).and_then(Value::as_object);
-        !writes && tokens.is_some_and(Map::is_empty)
-    }
-
     /// Whether a value is of the kind that the library reads there, and its contents decide: those that were tried did not fit.
     fn is_container(&self, place: &str, value: &Value) -> bool {
         let is_free = FREE.contains(&place.rsplit('/').next().unwrap_or_default());
@@ -190,12 +171,6 @@ impl Judge<'_> {
         let words = self.values.words(place);
         match value {
             Value::String(text) if words.is_some_and(|words| words.contains(text)) => Some(true),
-            Value::String(text) if key == "unk_token" => self.base?.id_of(text).map(|_| true),
-            Value::String(text) if place.ends_with("SpecialToken/id") => {
-                let (part, _) = at.rsplit_once("/single/").or_else(|| at.rsplit_once("/pair/"))?;
-                let tokens = self.document.get(&format!("{part}/special_tokens")).and_then(Value::as_object)?;
-                Some(tokens.contains_key(text))
-            }
             // The merges decide.
             Value::String(_) if place == "model BPE/continuing_subword_prefix" => Some(true),
             // One character.
@@ -203,11 +178,7 @@ impl Judge<'_> {
                 Some(text.chars().count() == 1).filter(|is_one| *is_one || place.ends_with("/replacement"))
             }
             Value::String(_) if CHOICES.contains(&key) || place.ends_with("Sequence/id") => Some(false),
-            Value::String(text) if key == "Regex" => is_pattern(text).then_some(true),
-            // A table of characters in base64.
-            Value::String(text) if key == "precompiled_charsmap" => {
-                Some(text.len() > 1000).filter(|is_table| *is_table)
-            }
+            Value::String(text) if key == "precompiled_charsmap" => Some(is_charsmap(text)),
             Value::Object(object) if key == "strategy" => {
                 Some(object.len() == 1 && object.get("Fixed").is_some_and(Value::is_u64))
             }

@@ -47,10 +47,6 @@ const REASONS: &[(&[&str], &str)] = &[
         "No document that is read is nested more deeply: src/checkpoint/scan.rs MAX_DEPTH.",
     ),
     (
-        &["src/check/tokenizer_json/values.rs MAX_PATTERN"],
-        "A longer pattern is not judged, and the tokenizer is not predicted.",
-    ),
-    (
         &["src/check/built_tokenizer.rs MAX_DEPTH", "src/check/tokenizer_json.rs MAX_DEPTH"],
         "Each takes two levels of a document, which has no more: src/checkpoint/scan.rs MAX_DEPTH.",
     ),
