@@ -23,6 +23,7 @@ pub mod peft;
 pub mod pickles;
 pub mod pins;
 pub mod prediction;
+pub mod preprocessors;
 pub mod problems;
 pub mod processor;
 pub mod program;
@@ -66,6 +67,7 @@ use names::LoaderNames;
 use parts::ModelParts;
 use peft::PeftKeys;
 use pickles::Pickles;
+use preprocessors::PreprocessorTable;
 use processor::Processor;
 use program::{AskedProgram, Program, Programs};
 use quantization::Scheme;
@@ -146,6 +148,8 @@ pub struct Knowledge {
     pub tokenizer_values: Table<TokenizerValues>,
     /// Tokenizer classes that do not open tokenizer.json as it is.
     pub tokenizers: Table<TokenizerClasses>,
+    /// Values of `preprocessor_config.json` that classes refuse.
+    pub preprocessors: Table<PreprocessorTable>,
     /// What `GenerationConfig` does with values.
     pub generation: Table<GenerationTable>,
     /// Modules with a weight of two dimensions.
@@ -202,6 +206,7 @@ impl Knowledge {
         LazyLock::force(&self.tokenizer_configs);
         LazyLock::force(&self.tokenizer_values);
         LazyLock::force(&self.tokenizers);
+        LazyLock::force(&self.preprocessors);
         LazyLock::force(&self.generation);
         LazyLock::force(&self.matrices);
         LazyLock::force(&self.text_types);
@@ -245,6 +250,7 @@ impl Knowledge {
             tokenizer_configs: table!(TokenizerConfigTable::embedded),
             tokenizer_values: table!(TokenizerValues::embedded),
             tokenizers: table!(TokenizerClasses::embedded),
+            preprocessors: table!(PreprocessorTable::embedded),
             generation: table!(GenerationTable::embedded),
             matrices: table!(Matrices::embedded),
             text_types: table!(TextTypes::embedded),

@@ -15,7 +15,7 @@ import torch  # noqa: F401
 import transformers  # noqa: F401
 
 TOOLS = ("names", "classes", "modules", "ropes", "parts", "tokenizers", "text_classes", "matrices", "generation",
-         "tokenizer_config", "tokenizer_values")  # fmt: skip
+         "tokenizer_config", "tokenizer_values", "preprocessors")  # fmt: skip
 
 
 def forked(tool):

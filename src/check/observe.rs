@@ -8,8 +8,8 @@
 use super::view::{ExplainingFacts, FilesView, Observation, VersionsView};
 use super::{
     adapter, built_tokenizer, card, class_names, directory, finite, generation, index, model_type, module_imports,
-    modules, pickles, processor, programs, refusals, ropes, statistics, templates, tokenizer_config, tokenizer_json,
-    tokens,
+    modules, pickles, preprocessor, processor, programs, refusals, ropes, statistics, templates, tokenizer_config,
+    tokenizer_json, tokens,
 };
 use crate::checkpoint::Fault;
 
@@ -49,6 +49,7 @@ const OF_VERSIONS: &[VersionsObserver] = &[
     |view| built_tokenizer::faults(view.checkpoint, view.knowledge, &view.asked).into(),
     |view| ropes::faults(view.checkpoint, view.knowledge, view.asked.targets).into(),
     |view| processor::faults(view).into(),
+    preprocessor::observe,
     adapter::fit::observe,
     generation::observe,
     tokenizer_config::observe,

@@ -49,7 +49,7 @@ fn value<'c>(checkpoint: &'c Checkpoint, file: &str, pointer: &str) -> Option<&'
 }
 
 /// The part whose settings stand in `processor_config.json`.
-fn nested_part(checkpoint: &Checkpoint) -> Option<&'static str> {
+pub(super) fn nested_part(checkpoint: &Checkpoint) -> Option<&'static str> {
     PARTS
         .into_iter()
         .find(|part| value(checkpoint, files::PROCESSOR_CONFIG, &format!("/{part}")).is_some_and(Value::is_object))

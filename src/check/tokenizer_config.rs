@@ -7,16 +7,16 @@ use serde_json::{Map, Value};
 
 use super::built_tokenizer::opened_class;
 use super::generation::is_truthy;
-use super::model_type::{CAP, short};
+use super::judged::{JudgedFiles, observed};
+use super::model_type::CAP;
 use super::tokenizer_json::{self, values};
-use super::view::{JudgedObject, Observation, VersionsView};
-use crate::checkpoint::fault::Faults;
+use super::view::{Observation, VersionsView};
 use crate::checkpoint::files::{self, Object};
 use crate::checkpoint::tokenizer::Merges;
 use crate::checkpoint::{Checkpoint, Document, Fault, FaultKind, Place, escape, pointer};
 use crate::knowledge::classes::ClassKind;
 use crate::knowledge::tokenizer_config::TokenizerClass;
-use crate::knowledge::tokenizer_values::TokenizerValue;
+use crate::knowledge::tokenizer_values::ValueOutcome;
 use crate::knowledge::{Knowledge, Loader};
 
 /// Faults of refused values, each under the loaders that raise, and for each loader whether all values were judged.
@@ -26,70 +26,14 @@ pub(super) fn observe(view: &VersionsView<'_>) -> Observation {
     let Some(document) = tokenizer_json::document(checkpoint) else { return Observation::default() };
     let is_read = document.value.is_some() && document.faults.iter().all(Fault::is_read_by_python);
     let of_file = is_read.then(|| values::judged(document, checkpoint.tokenizer.base(), &knowledge.tokenizer_values));
-    let (mut faults, mut objects) = (Vec::new(), Vec::new());
-    for target in asked.targets {
-        let judged = |loader| match &of_file {
-            Some(of_values) => judged(checkpoint, knowledge, loader, document, of_values),
-            None => JudgedFiles::unknown(format!("{} has no values that were read", files::TOKENIZER)),
-        };
-        let Some(judged) = Loader::beside(target.version()).into_iter().map(judged).reduce(JudgedFiles::and) else {
-            continue;
-        };
-        for fault in judged.refused.into_vec() {
-            fault.join(&mut faults, target.loader.version());
-        }
-        let not_judged = judged.unknown;
-        objects.push(JudgedObject { object: Object::Tokenizer, loader: target.loader.version(), not_judged });
-    }
-    Observation { faults, objects, ..Observation::default() }
+    observed(asked.targets, Object::Tokenizer, |loader| match &of_file {
+        Some(of_values) => judged(checkpoint, knowledge, loader, document, of_values),
+        None => unknown(format!("{} has no values that were read", files::TOKENIZER)),
+    })
 }
 
-/// What a version does with the files.
-#[derive(Default)]
-struct JudgedFiles {
-    /// The class that the files name.
-    class: String,
-    refused: Faults,
-    /// Why it may raise for other reasons.
-    unknown: Option<String>,
-}
-
-impl JudgedFiles {
-    fn unknown(why: String) -> Self {
-        Self { unknown: Some(why), ..Self::default() }
-    }
-
-    /// What a version between two others does: it refuses what both refuse, and may refuse what one does.
-    fn and(self, other: Self) -> Self {
-        let is_in = |faults: &[Fault], fault: &Fault| {
-            faults.iter().any(|same| (same.kind, &same.places) == (fault.kind, &fault.places))
-        };
-        let (own, others) = (self.refused.into_vec(), other.refused.into_vec());
-        let is_same = own.iter().all(|fault| is_in(&others, fault)) && others.iter().all(|fault| is_in(&own, fault));
-        let differs = (!is_same).then(|| "the versions beside this one do not refuse the same values".to_owned());
-        let mut refused = Faults::default();
-        refused.extend(own.into_iter().filter(|fault| is_in(&others, fault)));
-        Self { class: self.class, refused, unknown: self.unknown.or(other.unknown).or(differs) }
-    }
-
-    fn doubt(&mut self, why: String) {
-        self.unknown.get_or_insert(why);
-    }
-
-    fn value(&mut self, outcome: TokenizerValue, class: &str, file: &str, at: &str, value: Option<&Value>) {
-        match outcome {
-            TokenizerValue::Accepted => {}
-            TokenizerValue::Depends => self.doubt(format!("what {class} does with this {at} of {file} is not known")),
-            TokenizerValue::Refused => {
-                let key = at.rsplit('/').next().unwrap_or_default();
-                let fault = Fault::new(FaultKind::TokenizerSettingRefused)
-                    .at(Place::file(file).pointer(at))
-                    .with("class", self.class.as_str())
-                    .with("key", escape(key, CAP));
-                self.refused.push(value.into_iter().fold(fault, |fault, value| fault.with("value", short(value))));
-            }
-        }
-    }
+fn unknown(why: String) -> JudgedFiles {
+    JudgedFiles::new(FaultKind::TokenizerSettingRefused, String::new()).doubting(why)
 }
 
 /// Whether a key names files, or changes what is opened.
@@ -115,20 +59,16 @@ fn judged(
     document: &Document,
     of_values: &values::JudgedTokenizer,
 ) -> JudgedFiles {
-    let mut found = JudgedFiles::default();
     let Some(name) = opened_class(checkpoint, knowledge, loader) else {
-        return JudgedFiles::unknown("which class opens it is not known".to_owned());
+        return unknown("which class opens it is not known".to_owned());
     };
     let name = escape(&name, CAP);
-    // The same in all versions, whatever each opens in its place.
-    found.class = checkpoint
-        .tokenizer
-        .tokenizer_class
-        .as_deref()
-        .map_or_else(|| ClassKind::Tokenizer.auto().to_owned(), |class| escape(class, CAP));
+    let class = checkpoint.tokenizer.tokenizer_class.as_deref();
+    let class = class.map_or_else(|| ClassKind::Tokenizer.auto().to_owned(), |class| escape(class, CAP));
+    let mut found = JudgedFiles::new(FaultKind::TokenizerSettingRefused, class);
     let known = knowledge.tokenizer_configs.of(loader.version()).and_then(|configs| configs.class(&name));
     let Some(class) = known else {
-        return JudgedFiles::unknown(format!("which files {name} opens is not known"));
+        return unknown(format!("which files {name} opens is not known"));
     };
     found.unknown.clone_from(&of_values.unknown.as_ref().map(|at| format!("whether {at} loads is not known")));
     // A class that builds the tokenizer itself takes the vocabulary without the library.
@@ -217,20 +157,20 @@ fn of_settings(
         let at = pointer::join("", key);
         let outcome = match key.as_str() {
             // A rule of its own judges names.
-            "tokenizer_class" if value.is_string() || value.is_null() => TokenizerValue::Accepted,
-            "tokenizer_class" if is_truthy(value) => TokenizerValue::Refused,
-            "tokenizer_class" => TokenizerValue::Depends,
-            "auto_map" if value.is_object() => TokenizerValue::Accepted,
-            "auto_map" => TokenizerValue::Refused,
+            "tokenizer_class" if value.is_string() || value.is_null() => ValueOutcome::Accepted,
+            "tokenizer_class" if is_truthy(value) => ValueOutcome::Refused,
+            "tokenizer_class" => ValueOutcome::Depends,
+            "auto_map" if value.is_object() => ValueOutcome::Accepted,
+            "auto_map" => ValueOutcome::Refused,
             "added_tokens_decoder" => {
                 of_decoder(found, class, name, value);
-                TokenizerValue::Accepted
+                ValueOutcome::Accepted
             }
             // TOK010 reports it.
-            "extra_special_tokens" if value.is_array() && loader.major() < 5 => TokenizerValue::Depends,
-            key if opens_otherwise(key, value) => TokenizerValue::Depends,
+            "extra_special_tokens" if value.is_array() && loader.major() < 5 => ValueOutcome::Depends,
+            key if opens_otherwise(key, value) => ValueOutcome::Depends,
             key => match class.given(key, Some(value)) {
-                TokenizerValue::Depends => decided(key, value, settings),
+                ValueOutcome::Depends => decided(key, value, settings),
                 outcome => outcome,
             },
         };
@@ -239,7 +179,7 @@ fn of_settings(
 }
 
 /// What becomes of a value that others beside it decide.
-fn decided(key: &str, value: &Value, settings: &Map<String, Value>) -> TokenizerValue {
+fn decided(key: &str, value: &Value, settings: &Map<String, Value>) -> ValueOutcome {
     // T5 counts its own additional tokens, where there are any.
     let listed = settings.get("additional_special_tokens").and_then(Value::as_array);
     let own = listed.into_iter().flatten().filter(|token| {
@@ -247,8 +187,8 @@ fn decided(key: &str, value: &Value, settings: &Map<String, Value>) -> Tokenizer
         text.is_some_and(|text| text.contains("<extra_id_"))
     });
     match (key, value.as_u64().and_then(|count| usize::try_from(count).ok())) {
-        ("extra_ids", Some(count)) if [0, count].contains(&own.count()) => TokenizerValue::Accepted,
-        _ => TokenizerValue::Depends,
+        ("extra_ids", Some(count)) if [0, count].contains(&own.count()) => ValueOutcome::Accepted,
+        _ => ValueOutcome::Depends,
     }
 }
 
@@ -264,8 +204,8 @@ fn of_decoder(found: &mut JudgedFiles, class: &TokenizerClass<'_>, name: &str, v
         // Python reads blanks, signs and digits of other scripts as a number, too.
         let is_name = id.is_empty() || id.contains(|c: char| c.is_ascii_alphabetic());
         let outcome = match class.token(token) {
-            TokenizerValue::Accepted if is_name => TokenizerValue::Refused,
-            TokenizerValue::Accepted if !is_id => TokenizerValue::Depends,
+            ValueOutcome::Accepted if is_name => ValueOutcome::Refused,
+            ValueOutcome::Accepted if !is_id => ValueOutcome::Depends,
             outcome => outcome,
         };
         found.value(outcome, name, file, &at, Some(token));
@@ -282,7 +222,7 @@ fn of_older_files(
 ) {
     // Python takes the list out of the document, whatever the library reads.
     if document.get("/added_tokens").is_none() {
-        found.value(TokenizerValue::Refused, name, files::TOKENIZER, "/added_tokens", None);
+        found.value(ValueOutcome::Refused, name, files::TOKENIZER, "/added_tokens", None);
     }
     let read = |file: &str| checkpoint.has_file(file).then(|| checkpoint.document(file));
     for file in [files::SPECIAL_TOKENS, files::ADDED_TOKENS] {
@@ -294,7 +234,7 @@ fn of_older_files(
         };
         for (key, value) in entries {
             let outcome = if file == files::ADDED_TOKENS {
-                if value.is_u64() { TokenizerValue::Accepted } else { TokenizerValue::Depends }
+                if value.is_u64() { ValueOutcome::Accepted } else { ValueOutcome::Depends }
             } else if value.is_object() && key != "extra_special_tokens" {
                 class.token(value)
             } else {

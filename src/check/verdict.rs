@@ -15,6 +15,7 @@ use serde_json::Value;
 use super::finding::{Finding, FindingEffect};
 use super::index;
 use super::load::{LoadReport, Mismatch, SilentReason, Target, version};
+use super::preprocessor;
 use super::view::JudgedObject;
 use crate::checkpoint::{Checkpoint, Document, NotRead, untold};
 use crate::knowledge::program::AskedProgram;
@@ -210,14 +211,23 @@ impl Basis<'_> {
         unread.find(|(_, not_read)| *not_read != NotRead::Unreadable)
     }
 
-    /// Why `AutoTokenizer` of a loader may raise for config.json, which it reads first: transformers 5 for each tokenizer, and 4
-    /// where no file of the tokenizer names its class.
-    fn config_of_tokenizer(&self, loader: &str) -> Option<String> {
-        let is_read = loader.starts_with("5.") || self.checkpoint.tokenizer.tokenizer_class.is_none();
+    /// Why an Auto class of a loader may raise for config.json, which it reads first: `AutoTokenizer` of transformers 5 for each
+    /// tokenizer, and else where no other file names the class.
+    fn refused_config(&self, object: Object, loader: &str) -> Option<String> {
+        let is_read = match object {
+            Object::Tokenizer => loader.starts_with("5.") || self.checkpoint.tokenizer.tokenizer_class.is_none(),
+            Object::Processor => {
+                let settings =
+                    self.checkpoint.document(files::PREPROCESSOR_CONFIG).and_then(|d| d.value.as_ref()?.as_object());
+                settings.is_some_and(|settings| preprocessor::class_named(settings).is_none())
+            }
+            _ => false,
+        };
         let raises = |effect: &FindingEffect| {
             let concerns = (effect.object, effect.loader.as_str()) == (Object::Model, loader);
-            // transformers 5 reads a config that its class refuses with one of these errors as a config of no class.
-            let is_caught = loader.starts_with("5.") && effect.text.starts_with("ValueError");
+            // AutoTokenizer of transformers 5 reads a config that its class refuses with one of these errors as one of no class.
+            let is_caught =
+                object == Object::Tokenizer && loader.starts_with("5.") && effect.text.starts_with("ValueError");
             concerns && effect.outcome == Consequence::Raises && !is_caught
         };
         let mut of_config = self
@@ -226,7 +236,12 @@ impl Basis<'_> {
             .filter(|finding| finding.locations.iter().any(|location| location.file.as_deref() == Some(files::CONFIG)));
         let is_object = |document: &Document| document.value.as_ref().is_some_and(Value::is_object);
         let is_odd = self.checkpoint.document(files::CONFIG).is_some_and(|document| !is_object(document));
-        let refused = is_read && (is_odd || of_config.any(|finding| finding.effects.iter().any(raises)));
+        // AutoImageProcessor looks into each config.json.
+        let refused = if is_odd {
+            is_read || object == Object::Processor
+        } else {
+            is_read && of_config.any(|finding| finding.effects.iter().any(raises))
+        };
         refused.then(|| format!("{} is read first, and its class may refuse it", files::CONFIG))
     }
 
@@ -302,10 +317,7 @@ impl Basis<'_> {
                 Some(why) => (LoadVerdict::NotPredicted, Some(why.clone())),
                 None => (LoadVerdict::Loads, None),
             });
-            let unread_config = || {
-                let why = self.config_of_tokenizer(loader).filter(|_| object == Object::Tokenizer)?;
-                Some((LoadVerdict::NotPredicted, Some(why)))
-            };
+            let unread_config = || Some((LoadVerdict::NotPredicted, Some(self.refused_config(object, loader)?)));
             return not_read()
                 .or_else(unread_config)
                 .or_else(|| self.not_understood().filter(|_| object == Object::Adapter && judged.is_some()))

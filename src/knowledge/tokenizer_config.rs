@@ -8,7 +8,7 @@ use serde_json::{Map, Value};
 use super::by_version::ByVersion;
 use super::sorted::{Lazy, SortedMap};
 use super::source::DataError;
-use super::tokenizer_values::{self, TokenizerValue};
+use super::tokenizer_values::{self, ValueOutcome};
 
 /// Keys that no class has, whose letters stand for those of others with the same end.
 const OTHERS: [&str; 3] = ["_special_tokens", "_token", ""];
@@ -48,9 +48,9 @@ impl TokenizerConfigs {
         Some(TokenizerClass { usual: self, own: self.classes.get(name)?.get()? })
     }
 
-    fn outcome(&self, letters: &str, kind: &str) -> TokenizerValue {
+    fn outcome(&self, letters: &str, kind: &str) -> ValueOutcome {
         let at = self.kinds.iter().position(|name| name == kind);
-        at.and_then(|at| letters.as_bytes().get(at)).map_or(TokenizerValue::Depends, |letter| (*letter).into())
+        at.and_then(|at| letters.as_bytes().get(at)).map_or(ValueOutcome::Depends, |letter| (*letter).into())
     }
 }
 
@@ -64,18 +64,18 @@ pub struct TokenizerClass<'t> {
 impl TokenizerClass<'_> {
     /// What becomes of the value of a key of `tokenizer_config.json`, or of a missing one. Called for each key of the file.
     #[must_use]
-    pub fn given(&self, key: &str, value: Option<&Value>) -> TokenizerValue {
+    pub fn given(&self, key: &str, value: Option<&Value>) -> ValueOutcome {
         let known = self.keys(key).or_else(|| {
             let end = OTHERS.into_iter().find(|end| key.ends_with(end))?;
             self.keys(&format!("another{end}"))
         });
-        let Some(letters) = known else { return TokenizerValue::Depends };
+        let Some(letters) = known else { return ValueOutcome::Depends };
         let Some(value) = value else { return self.usual.outcome(letters, "absent") };
         if let Some(text) = value.as_str()
             && let Some(words) = self.own.words.get(key).or_else(|| self.usual.words.get(key))
             && words.as_ref().is_some_and(|words| words.contains(text))
         {
-            return TokenizerValue::Accepted;
+            return ValueOutcome::Accepted;
         }
         self.of(letters, value)
     }
@@ -87,14 +87,14 @@ impl TokenizerClass<'_> {
 
     /// What becomes of `added_tokens_decoder`, apart from its entries.
     #[must_use]
-    pub fn decoder(&self, value: &Value) -> TokenizerValue {
-        self.entry(".").map_or(TokenizerValue::Depends, |letters| self.usual.outcome(letters, kind(value)))
+    pub fn decoder(&self, value: &Value) -> ValueOutcome {
+        self.entry(".").map_or(ValueOutcome::Depends, |letters| self.usual.outcome(letters, kind(value)))
     }
 
     /// What becomes of an entry of `added_tokens_decoder`.
     #[must_use]
-    pub fn token(&self, value: &Value) -> TokenizerValue {
-        let Some(letters) = self.entry("") else { return TokenizerValue::Depends };
+    pub fn token(&self, value: &Value) -> ValueOutcome {
+        let Some(letters) = self.entry("") else { return ValueOutcome::Depends };
         match value.as_object() {
             Some(token) => self.fields(token).max(self.usual.outcome(letters, kind(value))),
             None => self.usual.outcome(letters, kind(value)),
@@ -103,10 +103,10 @@ impl TokenizerClass<'_> {
 
     /// What becomes of a tokenizer.json with a part, named by its slot and type: `pre_tokenizer ByteLevel`.
     #[must_use]
-    pub fn part(&self, part: &str) -> TokenizerValue {
+    pub fn part(&self, part: &str) -> ValueOutcome {
         let letters = self.own.parts.get(part).or_else(|| self.usual.parts.get(part));
         let letter = letters.and_then(|letters| letters.as_bytes().first());
-        letter.map_or(TokenizerValue::Depends, |letter| (*letter).into())
+        letter.map_or(ValueOutcome::Depends, |letter| (*letter).into())
     }
 
     fn keys(&self, key: &str) -> Option<&str> {
@@ -118,16 +118,16 @@ impl TokenizerClass<'_> {
     }
 
     /// The worst of the fields of a token. Others than those of a token are ignored.
-    fn fields(&self, token: &Map<String, Value>) -> TokenizerValue {
+    fn fields(&self, token: &Map<String, Value>) -> ValueOutcome {
         let fields = self.usual.entry.keys().filter(|key| !matches!(key.as_str(), "" | "."));
         let outcome = |key: &String| {
             let letters = self.entry(key)?;
             Some(self.usual.outcome(letters, token.get(key).map_or("absent", kind)))
         };
-        fields.filter_map(outcome).max().unwrap_or(TokenizerValue::Accepted)
+        fields.filter_map(outcome).max().unwrap_or(ValueOutcome::Accepted)
     }
 
-    fn of(&self, letters: &str, value: &Value) -> TokenizerValue {
+    fn of(&self, letters: &str, value: &Value) -> ValueOutcome {
         let outcome = self.usual.outcome(letters, kind(value));
         let tokens: Vec<&Map<String, Value>> = match value {
             Value::Object(object) if becomes_token(object) => vec![object],
@@ -140,8 +140,8 @@ impl TokenizerClass<'_> {
         // The fields count where an object becomes a token.
         let fields = tokens.into_iter().map(|token| self.fields(token)).max();
         match (outcome, fields) {
-            (TokenizerValue::Accepted, Some(TokenizerValue::Refused | TokenizerValue::Depends)) => {
-                if kind(value).starts_with("typed-token") { TokenizerValue::Refused } else { TokenizerValue::Depends }
+            (ValueOutcome::Accepted, Some(ValueOutcome::Refused | ValueOutcome::Depends)) => {
+                if kind(value).starts_with("typed-token") { ValueOutcome::Refused } else { ValueOutcome::Depends }
             }
             _ => outcome,
         }

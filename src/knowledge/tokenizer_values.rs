@@ -9,7 +9,7 @@ use super::source::{self, DataError};
 
 /// What becomes of a value, or of a key that is missing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum TokenizerValue {
+pub enum ValueOutcome {
     /// It loads.
     Accepted,
     /// The value, or others beside it, decide.
@@ -18,7 +18,7 @@ pub enum TokenizerValue {
     Refused,
 }
 
-impl From<u8> for TokenizerValue {
+impl From<u8> for ValueOutcome {
     /// The letter of a table.
     fn from(letter: u8) -> Self {
         match letter {
@@ -61,12 +61,12 @@ impl TokenizerValues {
 
     /// What becomes of a value; `None` for one at a place that is not read.
     #[must_use]
-    pub fn given(&self, place: &str, value: &Value) -> Option<TokenizerValue> {
+    pub fn given(&self, place: &str, value: &Value) -> Option<ValueOutcome> {
         self.outcome(place, kind(value))
     }
 
     /// The keys that an object may not be without, or perhaps not.
-    pub fn needed<'t>(&'t self, object: &'t str) -> impl Iterator<Item = (&'t str, TokenizerValue)> {
+    pub fn needed<'t>(&'t self, object: &'t str) -> impl Iterator<Item = (&'t str, ValueOutcome)> {
         // At the top, a place is a key alone; those of parts begin with their slot and a blank.
         let start = if object.is_empty() { String::new() } else { format!("{object}/") };
         let below = self.places.range(start..).map_while(move |(place, _)| {
@@ -75,7 +75,7 @@ impl TokenizerValues {
         });
         let own = below.filter(|(_, key)| !key.contains(['/', ' ']) && *key != "*");
         own.filter_map(|(place, key)| Some((key, self.outcome(place, "absent")?)))
-            .filter(|(_, outcome)| *outcome != TokenizerValue::Accepted)
+            .filter(|(_, outcome)| *outcome != ValueOutcome::Accepted)
     }
 
     /// Whether the library reads keys of an object at the place, and not elements of a list.
@@ -98,7 +98,7 @@ impl TokenizerValues {
         self.words.get(place)
     }
 
-    fn outcome(&self, place: &str, kind: &str) -> Option<TokenizerValue> {
+    fn outcome(&self, place: &str, kind: &str) -> Option<ValueOutcome> {
         let at = self.kinds.iter().position(|name| name == kind)?;
         Some((*self.places.get(place)?.as_bytes().get(at)?).into())
     }

@@ -232,6 +232,7 @@ fn the_page_of_data_files_is_fresh() {
          | `classes.json` | tokenizer and processor classes that each version opens by name, written by `tools/loader_classes.py` |\n\
          | `modules.json` | modules and names of transformers that some version lacks, written by `tools/loader_modules.py` |\n\
          | `generation.json` | values that GenerationConfig refuses, written by `tools/loader_generation.py` |\n\
+         | `preprocessors.json` | values that image processors and feature extractors refuse, written by `tools/loader_preprocessors.py` |\n\
          | `peft.json` | keys of `adapter_config.json` by version of PEFT, written by `tools/peft_keys.py` |\n\
          | `releases.json` | released versions of transformers and PEFT, written by `tools/releases.py` |\n\
          | `refused/` | values of config.json that each model class refuses, written by `tools/derive_architectures.py accepts` |\n\

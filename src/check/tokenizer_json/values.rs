@@ -10,7 +10,7 @@ use crate::check::model_type::{CAP, short};
 use crate::checkpoint::fault::KIND_CAP;
 use crate::checkpoint::tokenizer::Vocabulary;
 use crate::checkpoint::{Document, Fault, FaultKind, Place, escape, files, pointer};
-use crate::knowledge::tokenizer_values::{TokenizerValue, TokenizerValues};
+use crate::knowledge::tokenizer_values::{TokenizerValues, ValueOutcome};
 
 /// Lists of parts, and the part that each element is.
 const LISTS: [(&str, &str); 4] = [
@@ -84,7 +84,7 @@ impl Judge<'_> {
         for (key, outcome) in needed {
             let missing = pointer::join(at, key);
             match outcome {
-                TokenizerValue::Refused => self.refuse(&missing, None),
+                ValueOutcome::Refused => self.refuse(&missing, None),
                 _ => self.doubt(&missing),
             }
         }
@@ -131,9 +131,9 @@ impl Judge<'_> {
         }
         match self.values.given(place, value) {
             // Its only key decides.
-            Some(TokenizerValue::Depends) if value.is_object() && self.values.is_closed(place) => {}
-            Some(TokenizerValue::Refused) if !self.is_container(place, value) => return self.refuse(at, Some(value)),
-            Some(TokenizerValue::Depends) => match self.decided(place, at, value) {
+            Some(ValueOutcome::Depends) if value.is_object() && self.values.is_closed(place) => {}
+            Some(ValueOutcome::Refused) if !self.is_container(place, value) => return self.refuse(at, Some(value)),
+            Some(ValueOutcome::Depends) => match self.decided(place, at, value) {
                 Some(true) => {}
                 Some(false) => return self.refuse(at, Some(value)),
                 None => return self.doubt(at),

@@ -291,6 +291,7 @@ fault_kinds! {
         PostProcessorIdWrong = "post-processor-id-wrong" { token: Text, written: Integer, own: Integer },
         PostProcessorReplaced = "post-processor-replaced" { stored: Text, own: Text, class: Text },
         PrefixHijack = "prefix-hijack" { tensor: Text, by?: Text, under?: Text },
+        PreprocessorSettingRefused = "preprocessor-setting-refused" { class: Text, key: Text, value?: Any },
         ProgramLacksClass = "program-lacks-class" { program: Text, name: Text, class: OrNull(&Text) },
         ProgramLacksModelType = "program-lacks-model-type" { program: Text, name: Text, model_type: Text },
         ProgramReadsOtherFiles = "program-reads-other-files" {
