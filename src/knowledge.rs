@@ -45,6 +45,7 @@ pub mod tokenizer_config;
 pub mod tokenizer_parts;
 pub mod tokenizer_values;
 pub mod tokenizers;
+pub mod value_outcome;
 pub mod wrappers;
 
 use std::sync::LazyLock;

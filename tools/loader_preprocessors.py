@@ -6,19 +6,17 @@
 
 Every image processor and feature extractor is opened with values of every kind under each key that any of them saves or has as a
 parameter. There is a letter for each of `kinds`: `.` loads, `R` is refused, `d` depends on the value; the last one is that of a missing
-key. `keys` has the letters of most classes, and `classes` where one differs. `tried` has the texts and numbers that load, of those that
-were tried with the other settings as the class saves them, where others of their kind do not: first the one that the class saves. The key `another` stands for those that no class has. `names` has the class that a name in the file opens, and `types` the
-one that a model type opens where the file names none. Classes that are not opened with the values that they save are left out.
+key. `keys` has the letters of most classes, and `classes` where one differs. `tried` has the texts and numbers that load where others
+of their kind do not, first the one that the class saves; the others were tried beside the other settings that it saves. Numbers above
+`largest` were not tried. The key `another` stands for those that no class has. `names` has the class that a name in the file opens, and
+`types` the one that a model type opens where the file names none. Classes that are not opened with the values that they save are left out.
 """
 
-import collections
 import copy
 import datetime
-import inspect
 import json
 import os
 import random
-import re
 import sys
 import tempfile
 import warnings
@@ -33,7 +31,8 @@ from transformers.feature_extraction_utils import FeatureExtractionMixin
 from transformers.image_processing_base import ImageProcessingMixin
 from transformers.models.auto import feature_extraction_auto, image_processing_auto
 
-from by_version import keep
+import loader_tokenizer_config as constructed
+from by_version import keep, usual
 
 ROOT = Path(__file__).resolve().parents[1]
 FILE = ROOT / "rules" / "preprocessors.json"
@@ -47,7 +46,7 @@ KINDS = {
     "one": [1],
     "whole": [2, 7, 224, 16000],
     "negative": [-1, -7, -0.5],
-    "fraction": [0.37, 1.0, 0.0],
+    "fraction": [0.37, 1.0, 0.0, 7600.0, 44100.0],
     "text": ["x", "<nope>"],
     "empty-list": [[]],
     "pair": [[224, 224], [0.5, 0.25]],
@@ -104,6 +103,8 @@ NUMBERS = (
     44100,
     48000,
 )
+# The largest number that is tried: feature extractors make tables of such sizes.
+LARGEST = {"image": 10**9, "audio": 48000}
 # Keys that some classes make a size of.
 PIXELS = {"min_pixels": 3136, "max_pixels": 1003520}
 WORDS = (
@@ -122,19 +123,20 @@ WORDS = (
     "power",
 )
 NUMERIC = ("zero", "one", "whole", "negative", "fraction")
-NEVER = {"self", "args", "kwargs", "auto_map"}
+NAMED = ("image_processor_type", "feature_extractor_type")
+NEVER = {"self", "args", "kwargs", "auto_map", *NAMED}
 # The Auto class, what its classes have in common, the keys that name one, and the table of classes by model type.
 SIDES = {
     "image": (
         AutoImageProcessor,
         ImageProcessingMixin,
-        ("image_processor_type", "feature_extractor_type"),
+        NAMED,
         image_processing_auto.IMAGE_PROCESSOR_MAPPING_NAMES,
     ),
     "audio": (
         AutoFeatureExtractor,
         FeatureExtractionMixin,
-        ("feature_extractor_type",),
+        NAMED[1:],
         feature_extraction_auto.FEATURE_EXTRACTOR_MAPPING_NAMES,
     ),
 }
@@ -179,14 +181,9 @@ def opened_classes(side, folder, drawn=0):
 
 
 def parameters(cls):
-    """Parameters of the constructors of a class, and what they take from their keywords."""
-    constructors = [owner.__init__ for owner in cls.__mro__ if "__init__" in vars(owner) and owner is not object]
-    found = {name for one in constructors for name in inspect.signature(one).parameters}
-    found |= {
-        name for owner in cls.__mro__ for name in vars(owner.__dict__.get("valid_kwargs", object)).get("__annotations__", ())
-    }
-    read = re.compile(r'\bkwargs(?:\.(?:pop|get|setdefault)\(|\[)"(\w+)"')
-    return found.union(*(read.findall(inspect.getsource(one)) for one in constructors))
+    """Parameters of the constructors of a class, and the keywords that it declares."""
+    declared = [vars(owner).get("valid_kwargs", object) for owner in cls.__mro__]
+    return constructed.parameters(cls).union(*(vars(one).get("__annotations__", ()) for one in declared))
 
 
 def opens(cls, document):
@@ -230,12 +227,13 @@ def is_like(value, other):
     return True
 
 
-def of_class(cls, document, keys):
+def of_class(side, cls, document, keys):
     """{key: letters} and {key: texts and numbers} of a class."""
     found, tried = {}, {}
     for key in sorted(keys):
         letters = []
-        for values in KINDS.values():
+        for kind, values in KINDS.items():
+            values = [*values, LARGEST[side]] if kind == "whole" else values
             said = [opens(cls, {**document, key: value}) for value in values]
             or_else = not any(said) and any(opens(cls, {**document, **PIXELS, key: value}) for value in values)
             letters.append("." if all(said) else "d" if any(said) or or_else else "R")
@@ -247,23 +245,15 @@ def of_class(cls, document, keys):
         letters.append("." if key not in document or opens(cls, rest) else "R")
         found[key] = "".join(letters)
         strict = [kind for kind, letter in zip(KINDS, letters, strict=False) if letter != "."]
-        given = [document[key]] if key in document and own in (*NUMERIC, "text") else []
-        candidates = [word for word in WORDS if "text" in strict] + [number for number in NUMBERS if kind_of(number) in strict]
-        if given and own in strict or candidates:
+        given = [document[key]] if key in document else []
+        candidates = [word for word in WORDS if "text" in strict] + [
+            number for whole in NUMBERS for number in (whole, float(whole)) if kind_of(number) in strict
+        ]
+        is_larger = own in NUMERIC and document[key] > LARGEST[side]
+        if own in strict or is_larger or candidates:
             shown = {json.dumps(value): value for value in given + candidates}.values()
             tried[key] = [value for value in shown if opens(cls, {**document, key: value})]
     return found, tried
-
-
-def usual(tables):
-    """{key: what most tables have}, and {name: {key: what differs}}."""
-    keys = sorted({key for table in tables.values() for key in table})
-    most = {key: collections.Counter(str(table.get(key)) for table in tables.values()).most_common(1)[0][0] for key in keys}
-    most = {key: next(table.get(key) for table in tables.values() if str(table.get(key)) == most[key]) for key in keys}
-    other = {
-        name: {key: table.get(key) for key in keys if table.get(key) != most[key]} for name, table in sorted(tables.items())
-    }
-    return most, other
 
 
 def derived(side, folder, keys=(), drawn=0):
@@ -277,7 +267,7 @@ def derived(side, folder, keys=(), drawn=0):
     keys = keys or {key for cls, document in documents.items() for key in {*document, *parameters(cls)}} - NEVER
     found = {}
     for number, (cls, document) in enumerate(documents.items()):
-        found[cls.__name__] = of_class(cls, document, {*keys, "another"} - {*SIDES["image"][2]})
+        found[cls.__name__] = of_class(side, cls, document, {*keys, "another"})
         print(f"{transformers.__version__}: {cls.__name__}, {number + 1} of {len(documents)}", file=sys.stderr, flush=True)
     return found, *({name: cls and cls.__name__ for name, cls in table.items()} for table in (names, types))
 
@@ -312,14 +302,16 @@ def main():
         classes = {
             name: {part: tables[at][1][name] for at, part in enumerate(parts) if tables[at][1][name]} for name in sorted(found)
         }
-        entry[side] = {"names": names, "types": types, "keys": tables[0][0], "tried": tables[1][0], "classes": classes}
+        usually = {"keys": tables[0][0], "tried": tables[1][0]}
+        entry[side] = {"largest": LARGEST[side], "names": names, "types": types, **usually, "classes": classes}
 
     def shown(entry):
         def rows(table, space):
             return ",\n".join(f"{space}{json.dumps(k)}: {json.dumps(v, ensure_ascii=False)}" for k, v in table.items())
 
         def sides(table):
-            return ",\n".join(f'      "{k}": {{\n{rows(v, "        ")}\n      }}' for k, v in table.items())
+            texts = ((k, f"{{\n{rows(v, '        ')}\n      }}" if isinstance(v, dict) else v) for k, v in table.items())
+            return ",\n".join(f'      "{k}": {text}' for k, text in texts)
 
         return ",\n".join(
             f'    "{name}": ' + (json.dumps(table) if isinstance(table, list) else f"{{\n{sides(table)}\n    }}")

@@ -12,7 +12,6 @@ of those that were tried, where others do not. `entry` has the keys of a token i
 those that no class has. `names` are other names of classes, and `parts` are those of tokenizer.json that a class refuses.
 """
 
-import collections
 import datetime
 import inspect
 import itertools
@@ -34,7 +33,7 @@ from transformers.models.auto import tokenization_auto
 
 import loader_tokenizer_values
 import loader_tokenizers
-from by_version import keep
+from by_version import keep, usual
 
 ROOT = Path(__file__).resolve().parents[1]
 FILE = ROOT / "rules" / "tokenizer-settings.json"
@@ -250,17 +249,6 @@ def derived(folder, drawn, named):
         found[cls.__name__] = own
         print(f"{transformers.__version__}: {cls.__name__}, {number + 1} of {len(chosen)}", file=sys.stderr, flush=True)
     return found
-
-
-def usual(tables):
-    """{key: what most tables have}, and {name: {key: what differs}}."""
-    keys = sorted({key for table in tables.values() for key in table})
-    most = {key: collections.Counter(str(table.get(key)) for table in tables.values()).most_common(1)[0][0] for key in keys}
-    most = {key: next(table.get(key) for table in tables.values() if str(table.get(key)) == most[key]) for key in keys}
-    other = {
-        name: {key: table.get(key) for key in keys if table.get(key) != most[key]} for name, table in sorted(tables.items())
-    }
-    return most, other
 
 
 def whole(entry):

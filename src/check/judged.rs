@@ -9,7 +9,7 @@ use crate::checkpoint::fault::Faults;
 use crate::checkpoint::files::Object;
 use crate::checkpoint::{Fault, FaultKind, Place, escape};
 use crate::knowledge::Loader;
-use crate::knowledge::tokenizer_values::ValueOutcome;
+use crate::knowledge::value_outcome::ValueOutcome;
 
 /// What a version does with the files.
 pub(super) struct JudgedFiles {
@@ -25,11 +25,6 @@ pub(super) struct JudgedFiles {
 impl JudgedFiles {
     pub(super) fn new(kind: FaultKind, class: String) -> Self {
         Self { kind, class, refused: Faults::default(), unknown: None }
-    }
-
-    pub(super) fn doubting(mut self, why: String) -> Self {
-        self.doubt(why);
-        self
     }
 
     pub(super) fn doubt(&mut self, why: String) {
@@ -51,32 +46,42 @@ impl JudgedFiles {
             }
         }
     }
-
-    /// What a version between two others does: it refuses what both refuse, and may refuse what one does.
-    fn and(self, other: Self) -> Self {
-        let is_in = |faults: &[Fault], fault: &Fault| {
-            faults.iter().any(|same| (same.kind, &same.places) == (fault.kind, &fault.places))
-        };
-        let (own, others) = (self.refused.into_vec(), other.refused.into_vec());
-        let is_same = own.iter().all(|fault| is_in(&others, fault)) && others.iter().all(|fault| is_in(&own, fault));
-        let differs = (!is_same).then(|| "the versions beside this one do not refuse the same values".to_owned());
-        let mut refused = Faults::default();
-        refused.extend(own.into_iter().filter(|fault| is_in(&others, fault)));
-        Self { refused, unknown: self.unknown.or(other.unknown).or(differs), ..self }
-    }
 }
 
-/// The faults of what the known versions beside each target refuse, and for each target whether everything was judged.
-pub(super) fn observed(targets: &[Target], object: Object, judge: impl Fn(Loader) -> JudgedFiles) -> Observation {
+/// What a version refuses, and why it may raise for other reasons.
+type Answer = (Vec<Fault>, Option<String>);
+
+/// What a version between two others does: it refuses what both refuse, and may refuse what one does.
+fn between((own, unknown): Answer, (others, of_other): Answer) -> Answer {
+    let is_in = |faults: &[Fault], fault: &Fault| {
+        faults.iter().any(|same| (same.kind, &same.places) == (fault.kind, &fault.places))
+    };
+    let is_same = own.iter().all(|fault| is_in(&others, fault)) && others.iter().all(|fault| is_in(&own, fault));
+    let differs = (!is_same).then(|| "the versions beside this one do not refuse the same values".to_owned());
+    let both = own.into_iter().filter(|fault| is_in(&others, fault)).collect();
+    (both, unknown.or(of_other).or(differs))
+}
+
+/// The faults of what the known versions beside each target refuse, and for each target whether everything was judged. `judge`
+/// returns why a version is not judged at all, where it is not.
+pub(super) fn observed(
+    targets: &[Target],
+    object: Object,
+    judge: impl Fn(Loader) -> Result<JudgedFiles, String>,
+) -> Observation {
+    let answer = |loader| {
+        judge(loader).map_or_else(|why| (Vec::new(), Some(why)), |found| (found.refused.into_vec(), found.unknown))
+    };
     let (mut faults, mut objects) = (Vec::new(), Vec::new());
     for target in targets {
-        let Some(judged) = Loader::beside(target.version()).into_iter().map(&judge).reduce(JudgedFiles::and) else {
+        let Some((refused, not_judged)) = Loader::beside(target.version()).into_iter().map(answer).reduce(between)
+        else {
             continue;
         };
-        for fault in judged.refused.into_vec() {
+        for fault in refused {
             fault.join(&mut faults, target.loader.version());
         }
-        objects.push(JudgedObject { object, loader: target.loader.version(), not_judged: judged.unknown });
+        objects.push(JudgedObject { object, loader: target.loader.version(), not_judged });
     }
     Observation { faults, objects, ..Observation::default() }
 }

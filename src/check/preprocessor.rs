@@ -14,7 +14,6 @@ use crate::checkpoint::files::{self, Object};
 use crate::checkpoint::{Checkpoint, Document, Fault, FaultKind, escape, pointer};
 use crate::knowledge::classes::ClassKind;
 use crate::knowledge::names::NameKind;
-use crate::knowledge::tokenizer_values::ValueOutcome;
 use crate::knowledge::{Knowledge, Loader};
 
 /// Faults of refused values, each under the loaders that raise, and for each loader whether everything was judged.
@@ -24,51 +23,52 @@ pub(super) fn observe(view: &VersionsView<'_>) -> Observation {
     observed(asked.targets, Object::Processor, |loader| judged(checkpoint, knowledge, loader, document))
 }
 
-/// What a known version does with the file.
-fn judged(checkpoint: &Checkpoint, knowledge: &Knowledge, loader: Loader, document: &Document) -> JudgedFiles {
+/// What a known version does with the file, or why that is not known.
+fn judged(
+    checkpoint: &Checkpoint,
+    knowledge: &Knowledge,
+    loader: Loader,
+    document: &Document,
+) -> Result<JudgedFiles, String> {
     let file = files::PREPROCESSOR_CONFIG;
     let settings = document.value.as_ref().and_then(Value::as_object);
-    let named = settings.and_then(|settings| class_named(settings)?.1.as_str());
-    // The same in all versions, whatever each opens in its place.
-    let class = named.map_or_else(|| ClassKind::ImageProcessor.auto().to_owned(), |class| escape(class, CAP));
-    let found = JudgedFiles::new(FaultKind::PreprocessorSettingRefused, class);
     let Some(settings) = settings.filter(|_| document.faults.iter().all(Fault::is_read_by_python)) else {
-        return found.doubting(format!("{file} has no values that were read"));
+        return Err(format!("{file} has no values that were read"));
     };
+    let named = class_named(settings);
     if settings.contains_key("auto_map") || has_code(checkpoint, &[files::CONFIG], &AUTO) {
-        return found.doubting("its class is code beside the weights".to_owned());
+        return Err("its class is code beside the weights".to_owned());
+    }
+    if named.is_none() && checkpoint.config().is_some_and(has_config_code) {
+        return Err(format!("{} is of a class that is code beside the weights", files::CONFIG));
     }
     if nested_part(checkpoint).is_some() && loader.release() >= 457 {
-        return found.doubting(format!("{} has settings of a part, too", files::PROCESSOR_CONFIG));
+        return Err(format!("{} has settings of a part, too", files::PROCESSOR_CONFIG));
     }
     let text = |file: &str, at: &str| checkpoint.document(file)?.get(at)?.as_str();
     let model_type = text(files::CONFIG, "/model_type");
     let of_processor = OF_PROCESSOR.into_iter().find_map(|file| text(file, "/processor_class"));
-    if class_named(settings).is_none() && checkpoint.config().is_some_and(has_config_code) {
-        return found.doubting(format!("{} is of a class that is code beside the weights", files::CONFIG));
-    }
-    let kind = class_named(settings).map_or(ClassKind::ImageProcessor, |(kind, _)| kind);
-    if !knowledge.classes.reads(loader.version(), kind, of_processor, model_type) {
-        return found.doubting("the processor opens a class of its own".to_owned());
-    }
     let known = knowledge.preprocessors.of(loader.version());
     let Some(class) = known.and_then(|known| known.opened(settings, model_type)) else {
-        return found.doubting(format!("which class opens {file} is not known"));
+        return Err(format!("which class opens {file} is not known"));
     };
-    let mut found = found;
-    let missing = class.keys().filter(|key| !settings.contains_key(*key));
-    for key in missing {
+    let kind = named.map_or(class.kind, |(kind, _)| kind);
+    if !knowledge.classes.reads(loader.version(), kind, of_processor, model_type) {
+        return Err("the processor opens a class of its own".to_owned());
+    }
+    // The same in all versions, whatever each opens in its place.
+    let label = named.and_then(|(_, class)| class.as_str()).unwrap_or_else(|| class.kind.auto());
+    let mut found = JudgedFiles::new(FaultKind::PreprocessorSettingRefused, escape(label, CAP));
+    for key in class.keys().filter(|key| !settings.contains_key(*key)) {
         found.value(class.given(key, None), class.name, file, &pointer::join("", key), None);
     }
-    let names = [ClassKind::ImageProcessor.key(), ClassKind::FeatureExtractor.key()];
-    let mut alone = None;
-    for (key, value) in settings.iter().filter(|(key, _)| !names.contains(&key.as_str())) {
-        let mut outcome = class.given(key, Some(value));
-        // Two unusual values may not go together.
-        if outcome == ValueOutcome::Accepted && class.is_tried_alone(key, value) && alone.replace(key).is_some() {
-            outcome = ValueOutcome::Depends;
-        }
-        found.value(outcome, class.name, file, &pointer::join("", key), Some(value));
+    let mut alone = 0_usize;
+    for (key, value) in settings.iter().filter(|(key, _)| !NAMES.contains(&key.as_str())) {
+        alone = alone.saturating_add(class.is_tried_alone(key, value).into());
+        found.value(class.given(key, Some(value)), class.name, file, &pointer::join("", key), Some(value));
+    }
+    if alone > 1 {
+        found.doubt(format!("whether {} takes {alone} unusual values together is not known", class.name));
     }
     if checkpoint.document(files::CONFIG).is_some_and(|config| config.get("/pretrained_cfg").is_some()) {
         found.doubt(format!("{} has the settings of images in some versions", files::CONFIG));
@@ -80,8 +80,11 @@ fn judged(checkpoint: &Checkpoint, knowledge: &Knowledge, loader: Loader, docume
     if is_of_processor {
         found.doubt("what the processor does with its parts is not known".to_owned());
     }
-    found
+    Ok(found)
 }
+
+/// The keys that name the class.
+const NAMES: [&str; 2] = [ClassKind::ImageProcessor.key(), ClassKind::FeatureExtractor.key()];
 
 /// The Auto classes whose name in `auto_map` has the code of a repository opened.
 const AUTO: [&str; 3] =

@@ -16,7 +16,7 @@ use crate::checkpoint::tokenizer::Merges;
 use crate::checkpoint::{Checkpoint, Document, Fault, FaultKind, Place, escape, pointer};
 use crate::knowledge::classes::ClassKind;
 use crate::knowledge::tokenizer_config::TokenizerClass;
-use crate::knowledge::tokenizer_values::ValueOutcome;
+use crate::knowledge::value_outcome::ValueOutcome;
 use crate::knowledge::{Knowledge, Loader};
 
 /// Faults of refused values, each under the loaders that raise, and for each loader whether all values were judged.
@@ -28,12 +28,8 @@ pub(super) fn observe(view: &VersionsView<'_>) -> Observation {
     let of_file = is_read.then(|| values::judged(document, checkpoint.tokenizer.base(), &knowledge.tokenizer_values));
     observed(asked.targets, Object::Tokenizer, |loader| match &of_file {
         Some(of_values) => judged(checkpoint, knowledge, loader, document, of_values),
-        None => unknown(format!("{} has no values that were read", files::TOKENIZER)),
+        None => Err(format!("{} has no values that were read", files::TOKENIZER)),
     })
-}
-
-fn unknown(why: String) -> JudgedFiles {
-    JudgedFiles::new(FaultKind::TokenizerSettingRefused, String::new()).doubting(why)
 }
 
 /// Whether a key names files, or changes what is opened.
@@ -58,9 +54,9 @@ fn judged(
     loader: Loader,
     document: &Document,
     of_values: &values::JudgedTokenizer,
-) -> JudgedFiles {
+) -> Result<JudgedFiles, String> {
     let Some(name) = opened_class(checkpoint, knowledge, loader) else {
-        return unknown("which class opens it is not known".to_owned());
+        return Err("which class opens it is not known".to_owned());
     };
     let name = escape(&name, CAP);
     let class = checkpoint.tokenizer.tokenizer_class.as_deref();
@@ -68,7 +64,7 @@ fn judged(
     let mut found = JudgedFiles::new(FaultKind::TokenizerSettingRefused, class);
     let known = knowledge.tokenizer_configs.of(loader.version()).and_then(|configs| configs.class(&name));
     let Some(class) = known else {
-        return unknown(format!("which files {name} opens is not known"));
+        return Err(format!("which files {name} opens is not known"));
     };
     found.unknown.clone_from(&of_values.unknown.as_ref().map(|at| format!("whether {at} loads is not known")));
     // A class that builds the tokenizer itself takes the vocabulary without the library.
@@ -97,13 +93,13 @@ fn judged(
         config.value.as_ref().and_then(Value::as_object).filter(|_| config.faults.iter().all(Fault::is_read_by_python))
     }) else {
         found.doubt(format!("{} has no values that were read", files::TOKENIZER_CONFIG));
-        return found;
+        return Ok(found);
     };
     of_settings(&mut found, &class, &name, settings, loader);
     if !settings.contains_key("added_tokens_decoder") {
         of_older_files(&mut found, &class, &name, checkpoint, document);
     }
-    found
+    Ok(found)
 }
 
 /// Judges the vocabulary and the merges of tokenizer.json.

@@ -6,10 +6,11 @@ use serde::Deserialize;
 use serde_json::{Map, Value};
 
 use super::by_version::ByVersion;
-use super::classes::ClassKind;
+use super::classes::ClassKind::{self, FeatureExtractor, ImageProcessor};
 use super::sorted::{Lazy, SortedMap};
 use super::source::DataError;
-use super::tokenizer_values::{self, ValueOutcome};
+use super::tokenizer_values;
+use super::value_outcome::ValueOutcome;
 
 /// The key whose letters are those of a key that no class has.
 const OTHER: &str = "another";
@@ -20,7 +21,7 @@ type Tried = BTreeMap<String, Option<Vec<Value>>>;
 /// What a class does with values: a letter for each of the kinds.
 #[derive(Debug, Clone, Default, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-struct Letters {
+struct PreprocessorLetters {
     keys: BTreeMap<String, String>,
     tried: Tried,
 }
@@ -29,6 +30,8 @@ struct Letters {
 #[derive(Debug, Clone, Default, Deserialize)]
 #[serde(deny_unknown_fields, bound(deserialize = "'de: 'static"))]
 struct Side {
+    /// Numbers above it were not tried.
+    largest: f64,
     /// Classes by the key and the name in the file: `image_processor_type ViTImageProcessor`.
     names: SortedMap<&'static str>,
     /// Classes by model type, where the file names none.
@@ -36,7 +39,7 @@ struct Side {
     keys: BTreeMap<String, String>,
     tried: Tried,
     /// Classes, with what differs from the above.
-    classes: SortedMap<Lazy<Letters>>,
+    classes: SortedMap<Lazy<PreprocessorLetters>>,
 }
 
 /// What the classes of one version do. Source: the classes open documents that `tools/loader_preprocessors.py` writes.
@@ -55,26 +58,31 @@ impl Preprocessors {
     #[must_use]
     pub fn opened(&self, settings: &Map<String, Value>, model_type: Option<&str>) -> Option<PreprocessorClass<'_>> {
         let named = |kind: ClassKind| settings.get(kind.key()).filter(|value| !value.is_null());
-        let of = |side, kind: ClassKind, name: &Value| {
-            let name = format!("{} {}", kind.key(), name.as_str()?);
-            self.class(side, side.names.get(&name)?)
+        let of = |opened: ClassKind, key: ClassKind, name: &Value| {
+            let name = format!("{} {}", key.key(), name.as_str()?);
+            self.class(opened, self.side(opened).names.get(&name)?)
         };
-        if let Some(name) = named(ClassKind::ImageProcessor) {
-            return of(&self.image, ClassKind::ImageProcessor, name);
+        if let Some(name) = named(ImageProcessor) {
+            return of(ImageProcessor, ImageProcessor, name);
         }
-        if let Some(name) = named(ClassKind::FeatureExtractor) {
-            let kind = ClassKind::FeatureExtractor;
-            return of(&self.audio, kind, name).or_else(|| of(&self.image, kind, name));
+        if let Some(name) = named(FeatureExtractor) {
+            let image = || of(ImageProcessor, FeatureExtractor, name);
+            return of(FeatureExtractor, FeatureExtractor, name).or_else(image);
         }
         match (self.image.types.get(model_type?), self.audio.types.get(model_type?)) {
-            (Some(name), None) => self.class(&self.image, name),
-            (None, Some(name)) => self.class(&self.audio, name),
+            (Some(name), None) => self.class(ImageProcessor, name),
+            (None, Some(name)) => self.class(FeatureExtractor, name),
             _ => None,
         }
     }
 
-    fn class<'t>(&'t self, side: &'t Side, name: &'t str) -> Option<PreprocessorClass<'t>> {
-        Some(PreprocessorClass { kinds: &self.kinds, side, name, own: side.classes.get(name)?.get()? })
+    fn side(&self, kind: ClassKind) -> &Side {
+        if kind == FeatureExtractor { &self.audio } else { &self.image }
+    }
+
+    fn class<'t>(&'t self, kind: ClassKind, name: &'t str) -> Option<PreprocessorClass<'t>> {
+        let side = self.side(kind);
+        Some(PreprocessorClass { kinds: &self.kinds, side, kind, name, own: side.classes.get(name)?.get()? })
     }
 }
 
@@ -83,7 +91,9 @@ impl Preprocessors {
 pub struct PreprocessorClass<'t> {
     kinds: &'t [String],
     side: &'t Side,
-    own: &'t Letters,
+    own: &'t PreprocessorLetters,
+    /// Whether it is an image processor or a feature extractor.
+    pub kind: ClassKind,
     /// Its name.
     pub name: &'t str,
 }
@@ -95,6 +105,9 @@ impl PreprocessorClass<'_> {
         let Some(letters) = self.letters(key) else { return ValueOutcome::Depends };
         if value.is_some_and(|value| self.tried(key).is_some_and(|tried| tried.contains(value))) {
             return ValueOutcome::Accepted;
+        }
+        if value.and_then(Value::as_f64).is_some_and(|number| number > self.side.largest) {
+            return ValueOutcome::Depends;
         }
         let kind = value.map_or("absent", kind);
         let at = self.kinds.iter().position(|name| name == kind);

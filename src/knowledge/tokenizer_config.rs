@@ -8,7 +8,8 @@ use serde_json::{Map, Value};
 use super::by_version::ByVersion;
 use super::sorted::{Lazy, SortedMap};
 use super::source::DataError;
-use super::tokenizer_values::{self, ValueOutcome};
+use super::tokenizer_values;
+use super::value_outcome::ValueOutcome;
 
 /// Keys that no class has, whose letters stand for those of others with the same end.
 const OTHERS: [&str; 3] = ["_special_tokens", "_token", ""];

@@ -6,28 +6,7 @@ use serde::Deserialize;
 use serde_json::Value;
 
 use super::source::{self, DataError};
-
-/// What becomes of a value, or of a key that is missing.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum ValueOutcome {
-    /// It loads.
-    Accepted,
-    /// The value, or others beside it, decide.
-    Depends,
-    /// It is refused.
-    Refused,
-}
-
-impl From<u8> for ValueOutcome {
-    /// The letter of a table.
-    fn from(letter: u8) -> Self {
-        match letter {
-            b'R' => Self::Refused,
-            b'd' => Self::Depends,
-            _ => Self::Accepted,
-        }
-    }
-}
+use super::value_outcome::ValueOutcome;
 
 /// The table, which `tools/loader_tokenizer_values.py` writes. A place is a path of keys, as that tool names it.
 #[derive(Debug, Clone, Default, Deserialize)]

@@ -7,10 +7,10 @@ mod generation;
 mod lets;
 mod memory;
 mod names;
+mod objects;
 mod peft;
 mod refusals;
 mod seeded;
-mod tokenizer_files;
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;

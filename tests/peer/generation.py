@@ -12,24 +12,20 @@ predicted` of the generation config and of the model beside it. GenerationConfig
 `loads` where the class raises is a false clean, `raises` where it loads is a false raise.
 """
 
-import argparse
 import collections
 import inspect
 import json
 import os
 import random
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from differential import told_by
-from fresh import version_in
-from peer import Tally, check, workplace
+import drawn
+
 
 FILE = "generation_config.json"
 LIMITS = {"false clean": 0.01, "false raise": 0.01}
 SHARES = {"generation": 0.95, "model": 0.95}
-BATCH = 400
 VALUES = [None, True, False, 0, 1, 2, 4, 7, -1, 0.0, 1.0, 0.6, 1.5, -0.5, 2.0, "", "x", "never", "static", "hybrid", "auto", [], [1], [5, 6],
           [[5]], ["x"], [0, "x"], {}, {"x": 1}, {"1": 0.5}, 50256, 10**12, 1e30]  # fmt: skip
 RELATED = ["num_beams", "num_beam_groups", "do_sample", "num_return_sequences", "diversity_penalty", "suppress_tokens",
@@ -56,7 +52,7 @@ def own_documents():
     return [json.loads(text) for text in sorted(found)]
 
 
-def drawn(rng, documents, keys):
+def drawn_text(rng, documents, keys):
     """The bytes of a document, and what was done to it."""
     document = dict(rng.choice(documents))
     done = []
@@ -141,7 +137,9 @@ def worker(_, work, seed, count, corpus):
             folder.mkdir()
             for file in model.iterdir():
                 (folder / file.name).symlink_to(file) if file.suffix != ".json" else os.link(file, folder / file.name)
-            text, done = (files[number].read_bytes(), "as published") if number < len(files) else drawn(rng, documents, keys)
+            text, done = (
+                (files[number].read_bytes(), "as published") if number < len(files) else drawn_text(rng, documents, keys)
+            )
             (folder / FILE).write_bytes(text)
             told = {
                 "folder": str(folder),
@@ -163,72 +161,19 @@ def arguments(cls):
 # All versions.
 
 
-def run_worker(folder, work, a):
-    """The documents of one version."""
-    version = version_in(folder)
-    return version, told_by(__file__, folder, work / version, a.seed, a.count, a.corpus or "-")
-
-
 def judge(tally, a, version, told):
-    counts = {"generation": collections.Counter(), "model": collections.Counter()}
-    for at in range(0, len(told), BATCH):
-        batch = told[at : at + BATCH]
-        entries = check(
-            "--for",
-            f"transformers=={version}",
-            "--follow-links",
-            str(Path(batch[0]["folder"]).parent),
-            *(t["folder"] for t in batch),
-        )[0]
-        for one in batch:
-            load = next(load for load in entries[os.path.realpath(one["folder"])]["loads"] if load["loader"] == version)
-            for kind, of in counts.items():
-                actual = one[kind]
-                if actual == "not tried":
-                    continue
-                said = next((o for o in load["objects"] if o["object"] == kind), {"verdict": "none"})
-                of[outcome := compared(said["verdict"], actual)] += 1
-                if a.list and outcome != "right":
-                    why = said.get("why") or ", ".join(said.get("findings", []))
-                    print(
-                        f"{outcome}: {version} {kind} {one['folder']} [{one['done']}]: said {said['verdict']} ({why}); {actual}"[
-                            :500
-                        ]
-                    )
+    counts = {kind: collections.Counter() for kind in SHARES}
+    for one, objects in drawn.verdicts(version, told, "--follow-links", str(Path(told[0]["folder"]).parent)):
+        for kind, of in counts.items():
+            if one[kind] == "not tried":
+                continue
+            outcome = drawn.compared(objects[kind]["verdict"], one[kind])
+            of[outcome] += 1
+            if a.list and outcome != "right":
+                print(drawn.shown(outcome, f"{version} {kind}", one, objects[kind], one[kind]))
     for kind, of in counts.items():
-        total, judged = sum(of.values()), sum(of.values()) - of["not predicted"]
-        print(f"{version}: {total} of {kind}, {dict(sorted(of.items()))}", flush=True)
-        for outcome, limit in LIMITS.items():
-            tally.expect(of[outcome] <= max(1, limit * judged), f"{version}: {of[outcome]} of {judged} {outcome} of {kind}")
-        tally.expect(judged >= SHARES[kind] * total, f"{version}: {judged} of {total} are predicted of {kind}")
-
-
-def compared(said, actual):
-    if said in ("not-predicted", "none"):
-        return "not predicted"
-    if (said == "raises") == (actual is not None):
-        return "right"
-    return "false clean" if actual is not None else "false raise"
-
-
-def main():
-    if sys.argv[1:2] == ["--worker"]:
-        return worker(*sys.argv[2:])
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("folder", nargs="+")
-    p.add_argument("--count", type=int, default=500, help="for each version")
-    p.add_argument("--seed", default="1")
-    p.add_argument("--corpus", help="a directory with published files")
-    p.add_argument("--list", action="store_true", help="print every verdict that is not right")
-    p.add_argument("--keep", type=Path)
-    a = p.parse_args()
-    tally = Tally()
-    with workplace() as temporary, ThreadPoolExecutor(2) as pool:
-        work = a.keep or temporary
-        for version, told in pool.map(lambda folder: run_worker(folder, work, a), a.folder):
-            judge(tally, a, version, told)
-    tally.finish()
+        drawn.expect(tally, version, kind, of, LIMITS, SHARES[kind])
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(drawn.main(__file__, __doc__, worker, judge, 500))

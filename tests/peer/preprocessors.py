@@ -7,32 +7,27 @@ Each FOLDER has one version of transformers, for the Python that runs this. The 
 save; `--corpus` adds the directories below one that have a preprocessor_config.json and a config.json. Most of the N documents for each version have
 changes: values of other kinds, keys of other documents, keys that are lost, damaged text, another model type. `check --for` that version
 says `raises`, `loads wrong`, `loads` or `not predicted` of the processor. AutoImageProcessor or AutoFeatureExtractor opens the file, or
-AutoProcessor where the files name a processor.
+AutoProcessor where the files name a processor. The cases of tests/data/preprocessor-cases.json are opened as well, and have to be what that
+file says.
 
 `loads` where these raise is a false clean, `raises` where one opens it is a false raise.
 """
 
-import argparse
 import collections
 import json
-import os
 import random
 import shutil
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from differential import told_by
-from fresh import version_in
-from generation import compared
-from peer import Tally, check, workplace
+import drawn
 from tokenizer_files import changed_text, places
 
 FILE = "preprocessor_config.json"
 CONFIG = "config.json"
+CASES = Path(__file__).resolve().parents[1] / "data" / "preprocessor-cases.json"
 LIMITS = {"false clean": 0.01, "false raise": 0.01}
 SHARE = 0.9
-BATCH = 400
 VALUES = [None, True, False, 0, 1, 3, 224, -1, 0.5, 1.0, 1e-5, "", "x", "bilinear", [], [224], [224, 224], [0.5, 0.5, 0.5], [0.1] * 4, ["x"],
           [[1]], {}, {"height": 224, "width": 224}, {"shortest_edge": 256}, {"longest_edge": 800, "shortest_edge": 600},
           {"longest_edge": 800}, {"max_height": 400, "max_width": 300}, {"height": 224}, {"x": 1}, {"height": "x", "width": 2},
@@ -164,59 +159,35 @@ def worker(_, work, seed, count, corpus):
             told = {"folder": str(folder), "done": done, "actual": happened(folder, number < len(published))}
             of = "published" if number < len(published) else "drawn, of a processor" if is_of_processor(folder) else "drawn"
             out.write(json.dumps({**told, "kind": of}) + "\n")
+        data = json.loads(CASES.read_text())
+        at = data["versions"].index(transformers.__version__)
+        for number, case in enumerate(data["cases"]):
+            folder = work / f"c-{number}"
+            folder.mkdir()
+            (folder / CONFIG).write_text(json.dumps(case["config"]))
+            (folder / FILE).write_text(json.dumps(case["settings"]))
+            told = {"folder": str(folder), "done": json.dumps(case), "actual": happened(folder, True), "kind": "case"}
+            out.write(json.dumps({**told, "expected": case["actual"][at]}) + "\n")
     (work / "told.partial").rename(work / "told.jsonl")
 
 
 # All versions.
 
 
-def run_worker(folder, work, a):
-    """The documents of one version."""
-    version = version_in(folder)
-    return version, told_by(__file__, folder, work / version, a.seed, a.count, a.corpus or "-")
-
-
 def judge(tally, a, version, told):
+    for one in told:
+        expected, actual = one.get("expected"), one["actual"]
+        tally.expect(expected in (None, "raises" if actual else "loads"), f"{version}: {one['done']}: {actual}")
     counts = collections.defaultdict(collections.Counter)
-    for at in range(0, len(told), BATCH):
-        batch = told[at : at + BATCH]
-        entries = check("--for", f"transformers=={version}", *(t["folder"] for t in batch))[0]
-        for one in batch:
-            load = next(load for load in entries[os.path.realpath(one["folder"])]["loads"] if load["loader"] == version)
-            said = next(o for o in load["objects"] if o["object"] == "processor")
-            outcome = compared(said["verdict"], one["actual"])
-            counts[one["kind"]][outcome] += 1
-            if a.list and outcome != "right":
-                why = said.get("why") or ", ".join(said.get("findings", []))
-                line = f"{outcome}: {version} {one['folder']} [{one['done']}]: said {said['verdict']} ({why}); {one['actual']}"
-                print(line[:500])
+    for one, objects in drawn.verdicts(version, told):
+        said = objects["processor"]
+        outcome = drawn.compared(said["verdict"], one["actual"])
+        counts[one["kind"]][outcome] += 1
+        if a.list and outcome != "right":
+            print(drawn.shown(outcome, version, one, said, one["actual"]))
     for kind, of in counts.items():
-        total, judged = sum(of.values()), sum(of.values()) - of["not predicted"]
-        print(f"{version}: {total} {kind}, {dict(sorted(of.items()))}", flush=True)
-        for outcome, limit in LIMITS.items():
-            tally.expect(of[outcome] <= max(1, limit * judged), f"{version}: {of[outcome]} of {judged} {kind} {outcome}")
-        if kind == "drawn":
-            tally.expect(judged >= SHARE * total, f"{version}: {judged} of {total} {kind} are predicted")
-
-
-def main():
-    if sys.argv[1:2] == ["--worker"]:
-        return worker(*sys.argv[2:])
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("folder", nargs="+")
-    p.add_argument("--count", type=int, default=1000, help="for each version")
-    p.add_argument("--seed", default="1")
-    p.add_argument("--corpus", help="a directory with published files")
-    p.add_argument("--list", action="store_true", help="print every verdict that is not right")
-    p.add_argument("--keep", type=Path)
-    a = p.parse_args()
-    tally = Tally()
-    with workplace() as temporary, ThreadPoolExecutor(2) as pool:
-        work = a.keep or temporary
-        for version, told in pool.map(lambda folder: run_worker(folder, work, a), a.folder):
-            judge(tally, a, version, told)
-    tally.finish()
+        drawn.expect(tally, version, kind, of, LIMITS, SHARE if kind == "drawn" else 0)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(drawn.main(__file__, __doc__, worker, judge, 1000))

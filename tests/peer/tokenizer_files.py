@@ -12,24 +12,19 @@ tests/data/tokenizer-cases.json are opened as well, and have to be what that fil
 `loads` where AutoTokenizer raises is a false clean, `raises` where it opens is a false raise.
 """
 
-import argparse
 import collections
 import json
 import os
 import random
 import shutil
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from differential import told_by
-from fresh import version_in
-from generation import compared
-from peer import Tally, check, workplace
+import drawn
+
 
 LIMITS = {"false clean": 0.02, "false raise": 0.015}
 SHARE = 0.7
-BATCH = 300
 FILES = ["tokenizer_config.json", "tokenizer.json", "special_tokens_map.json", "added_tokens.json", "config.json"]
 LARGEST = 40_000_000
 CASES = Path(__file__).resolve().parents[1] / "data" / "tokenizer-cases.json"
@@ -182,57 +177,22 @@ def worker(_, work, seed, count, corpus):
 # All versions.
 
 
-def run_worker(folder, work, a):
-    """The directories of one version."""
-    version = version_in(folder)
-    return version, told_by(__file__, folder, work / version, a.seed, a.count, a.corpus or "-")
-
-
 def judge(tally, a, version, told):
     for one in told:
         expected, actual = one.get("expected"), one["actual"]
         tally.expect(expected in (None, "raises" if actual else "loads"), f"{version}: {one['done']}: {actual}")
     counts = {"published": collections.Counter(), "drawn": collections.Counter()}
-    for at in range(0, len(told), BATCH):
-        batch = told[at : at + BATCH]
-        entries = check("--for", f"transformers=={version}", *(t["folder"] for t in batch))[0]
-        for one in batch:
-            load = next(load for load in entries[os.path.realpath(one["folder"])]["loads"] if load["loader"] == version)
-            said = next((o for o in load["objects"] if o["object"] == "tokenizer"), {"verdict": "none"})
-            outcome = compared(said["verdict"], one["actual"])
-            # A directory that offers no tokenizer has no verdict on it.
-            if said["verdict"] != "none" or one["actual"] is None:
-                counts["published" if one["published"] else "drawn"][outcome] += 1
-            if a.list and outcome != "right":
-                why = said.get("why") or ", ".join(said.get("findings", []))
-                line = f"{outcome}: {version} {one['folder']} [{one['done']}]: said {said['verdict']} ({why}); {one['actual']}"
-                print(line[:600])
+    for one, objects in drawn.verdicts(version, told):
+        said = objects["tokenizer"]
+        outcome = drawn.compared(said["verdict"], one["actual"])
+        # A directory that offers no tokenizer has no verdict on it.
+        if said["verdict"] != "none" or one["actual"] is None:
+            counts["published" if one["published"] else "drawn"][outcome] += 1
+        if a.list and outcome != "right":
+            print(drawn.shown(outcome, version, one, said, one["actual"]))
     for kind, of in counts.items():
-        total, judged = sum(of.values()), sum(of.values()) - of["not predicted"]
-        print(f"{version}: {total} {kind}, {dict(sorted(of.items()))}", flush=True)
-        for outcome, limit in LIMITS.items():
-            tally.expect(of[outcome] <= max(1, limit * judged), f"{version}: {of[outcome]} of {judged} {kind} {outcome}")
-        tally.expect(judged >= SHARE * total, f"{version}: {judged} of {total} {kind} are predicted")
-
-
-def main():
-    if sys.argv[1:2] == ["--worker"]:
-        return worker(*sys.argv[2:])
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("folder", nargs="+")
-    p.add_argument("--count", type=int, default=400, help="for each version")
-    p.add_argument("--seed", default="1")
-    p.add_argument("--corpus", help="a directory with published files")
-    p.add_argument("--list", action="store_true", help="print every verdict that is not right")
-    p.add_argument("--keep", type=Path)
-    a = p.parse_args()
-    tally = Tally()
-    with workplace() as temporary, ThreadPoolExecutor(2) as pool:
-        work = a.keep or temporary
-        for version, told in pool.map(lambda folder: run_worker(folder, work, a), a.folder):
-            judge(tally, a, version, told)
-    tally.finish()
+        drawn.expect(tally, version, kind, of, LIMITS, SHARE)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(drawn.main(__file__, __doc__, worker, judge, 400))

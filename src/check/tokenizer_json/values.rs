@@ -10,7 +10,8 @@ use crate::check::model_type::{CAP, short};
 use crate::checkpoint::fault::KIND_CAP;
 use crate::checkpoint::tokenizer::Vocabulary;
 use crate::checkpoint::{Document, Fault, FaultKind, Place, escape, files, pointer};
-use crate::knowledge::tokenizer_values::{TokenizerValues, ValueOutcome};
+use crate::knowledge::tokenizer_values::TokenizerValues;
+use crate::knowledge::value_outcome::ValueOutcome;
 
 /// Lists of parts, and the part that each element is.
 const LISTS: [(&str, &str); 4] = [
